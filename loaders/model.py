@@ -1,0 +1,225 @@
+"""The one model every loader fills and the audit reads: flat arrays, one block per table.
+
+Frames: ``world`` is the reconstruction's frame, ``cam`` the camera's (x right, y down, z forward). Image points are
+in pixels of the distorted image, centre of the first pixel at (0.5, 0.5). Ids are the stored ones, ``*_idx`` are rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+
+from loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from loaders.camera_models import BY_ID, CameraModel
+
+
+class FindingCode(StrEnum):
+    """What can be wrong with a model that is nevertheless readable. A closed list, documented in docs/findings.md."""
+
+    BINARY_TEXT_DISAGREE = "binary_text_disagree"
+    TRACKS_DISAGREE = "tracks_disagree"
+    DANGLING_POINT_IDS = "dangling_point_ids"
+    UNSEEN_POINTS = "unseen_points"
+    SHORT_TRACKS = "short_tracks"
+    REPEATED_OBSERVATIONS = "repeated_observations"
+    STORED_ERRORS_ZERO = "stored_errors_zero"
+    STORED_ERRORS_MISSING = "stored_errors_missing"
+    STORED_ERRORS_STALE = "stored_errors_stale"
+    ORPHAN_CAMERAS = "orphan_cameras"
+    MISSING_CAMERAS = "missing_cameras"
+    NON_UNIT_QUATERNIONS = "non_unit_quaternions"
+    NON_FINITE_POSES = "non_finite_poses"
+    NON_FINITE_POINTS = "non_finite_points"
+    NON_FINITE_CAMERAS = "non_finite_cameras"
+    NON_FINITE_OBSERVATIONS = "non_finite_observations"
+    OBSERVATIONS_OUTSIDE = "observations_outside"
+    IMAGE_SIZE_SWAPPED = "image_size_swapped"
+    DUPLICATE_NAMES = "duplicate_names"
+    INCOMPLETE_RIGS = "incomplete_rigs"
+    EMPTY_MODEL = "empty_model"
+    POINTS_NOT_OPTIMAL = "points_not_optimal"
+    TRACK_STATISTICS_FROM_ALL_IMAGES = "track_statistics_from_all_images"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An inconsistency of a readable model: a code, how many items it concerns, one line for people."""
+
+    code: FindingCode
+    count: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraRecord:
+    """One camera: ``params`` (num_params,) float64 in the order of ``model.param_names``, px and dimensionless."""
+
+    camera_id: int
+    model: CameraModel
+    width: int
+    height: int
+    params: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageRecord:
+    """One registered image.
+
+    camera: None when the model has no camera of that id.
+    rotation_cam_from_world: (3, 3) from the quaternion as stored (COLMAP does not normalise it either).
+    translation_cam_from_world: (3,), model units.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    camera: CameraRecord | None
+    rotation_cam_from_world: FloatArray
+    translation_cam_from_world: FloatArray
+    num_points2d: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraTable:
+    """All cameras, sorted by camera_id. ``params`` of camera i = params[param_offsets[i]:param_offsets[i + 1]]."""
+
+    camera_id: UInt32Array
+    model_id: IntArray
+    width: IntArray
+    height: IntArray
+    params: FloatArray
+    param_offsets: IntArray
+
+    def __len__(self) -> int:
+        return len(self.camera_id)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageTable:
+    """All registered images, sorted by image_id.
+
+    camera_idx: (I,) row of CameraTable, -1 where the camera does not exist.
+    quat_cam_from_world_wxyz: (I, 4) as stored (or composed from rigs and frames), not normalised.
+    translation_cam_from_world: (I, 3) model units.    num_points2d: (I,) all 2D points, linked or not.
+    """
+
+    image_id: UInt32Array
+    name: tuple[str, ...]
+    camera_id: UInt32Array
+    camera_idx: IntArray
+    quat_cam_from_world_wxyz: FloatArray
+    translation_cam_from_world: FloatArray
+    num_points2d: IntArray
+
+    def __len__(self) -> int:
+        return len(self.image_id)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTable:
+    """All 3D points, sorted by point3d_id. stored_error_px: (P,) as stored, -1 where COLMAP has none."""
+
+    point3d_id: UInt64Array
+    xyz_world: FloatArray
+    stored_error_px: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.point3d_id)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservationTable:
+    """All *linked* 2D points (those with a point id), by image in ImageTable order, then by POINTS2D order.
+
+    offsets: (I + 1,), image i owns rows offsets[i]:offsets[i + 1].    point2d_idx: (M,) position in POINTS2D.
+    xy_px: (M, 2).    point_idx: (M,) row of PointTable, -1 where the point does not exist (dangling).
+    """
+
+    offsets: IntArray
+    point2d_idx: IntArray
+    xy_px: FloatArray
+    point_idx: IntArray
+
+    def __len__(self) -> int:
+        return len(self.point_idx)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SparseModel:
+    """A reconstruction, columnar: what the images themselves say, links taken from the images' own point ids."""
+
+    location: str
+    file_format: Literal["binary", "text"]
+    cameras: CameraTable
+    images: ImageTable
+    points: PointTable
+    observations: ObservationTable
+    findings: tuple[Finding, ...]
+
+    def camera(self, camera_idx: int) -> CameraRecord:
+        """Return the camera in row ``camera_idx`` of the camera table."""
+        table = self.cameras
+        first, last = table.param_offsets[camera_idx : camera_idx + 2]
+        return CameraRecord(
+            int(table.camera_id[camera_idx]),
+            BY_ID[int(table.model_id[camera_idx])],
+            int(table.width[camera_idx]),
+            int(table.height[camera_idx]),
+            table.params[first:last],
+        )
+
+    def image(self, image_idx: int) -> ImageRecord:
+        """Return the image in row ``image_idx`` of the image table."""
+        table = self.images
+        camera_idx = int(table.camera_idx[image_idx])
+        return ImageRecord(
+            int(table.image_id[image_idx]),
+            table.name[image_idx],
+            int(table.camera_id[image_idx]),
+            None if camera_idx < 0 else self.camera(camera_idx),
+            rotation_from_quat(table.quat_cam_from_world_wxyz[image_idx]),
+            table.translation_cam_from_world[image_idx],
+            int(table.num_points2d[image_idx]),
+        )
+
+    def image_idx(self, name: str) -> int:
+        """Return the row of the image called ``name`` (or ``id:<image_id>``); KeyError when there is none."""
+        if name in self.images.name:
+            return self.images.name.index(name)
+        if name.startswith("id:") and name[3:].isdigit():
+            rows = np.flatnonzero(self.images.image_id == int(name[3:]))
+            if len(rows):
+                return int(rows[0])
+        raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InlierSet:
+    """The 2D-3D inliers of one image (METHOD.md section 1); row i of every array is the same observation.
+
+    xy_px: (n, 2) float64, observed, distorted; first pixel centre = (0.5, 0.5).
+    xyz_world: (n, 3) float64, model units.      point_idx: (n,) int64, rows of SparseModel.points.
+    The other counts say what was linked but is no inlier: point missing, behind the camera, projection not finite.
+    """
+
+    image: ImageRecord
+    xy_px: FloatArray
+    xyz_world: FloatArray
+    point_idx: IntArray
+    num_dangling: int = 0
+    num_behind: int = 0
+    num_nonfinite: int = 0
+
+
+def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
+    """Return (..., 3, 3) matrices of (..., 4) quaternions w x y z, without normalising them, like COLMAP."""
+    w, x, y, z = np.moveaxis(np.asarray(quat_wxyz, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
