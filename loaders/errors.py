@@ -57,3 +57,7 @@ class MalformedFileError(LoadError):
 
 class LfsPointerError(LoadError):
     """The file is a Git LFS pointer, not the data it stands for."""
+
+
+class UnreadableFileError(LoadError):
+    """The operating system refuses to read the file, or it is no regular file."""

@@ -40,6 +40,9 @@ class FindingCode(StrEnum):
     DUPLICATE_NAMES = "duplicate_names"
     INCOMPLETE_RIGS = "incomplete_rigs"
     EMPTY_MODEL = "empty_model"
+    STATED_COUNT_DIFFERS = "stated_count_differs"
+    UNTERMINATED_TEXT = "unterminated_text"
+    EXACT_PROJECTIONS = "exact_projections"
     POINTS_NOT_OPTIMAL = "points_not_optimal"
     TRACK_STATISTICS_FROM_ALL_IMAGES = "track_statistics_from_all_images"
 
@@ -69,7 +72,7 @@ class ImageRecord:
     """One registered image.
 
     camera: None when the model has no camera of that id.
-    rotation_cam_from_world: (3, 3) from the quaternion as stored (COLMAP does not normalise it either).
+    quat_cam_from_world_wxyz: (4,) as stored; not normalised (COLMAP does not normalise it either).
     translation_cam_from_world: (3,), model units.
     """
 
@@ -77,9 +80,32 @@ class ImageRecord:
     name: str
     camera_id: int
     camera: CameraRecord | None
-    rotation_cam_from_world: FloatArray
+    quat_cam_from_world_wxyz: FloatArray
     translation_cam_from_world: FloatArray
     num_points2d: int
+
+    @property
+    def rotation_cam_from_world(self) -> FloatArray:
+        """(3, 3) matrix of the quaternion."""
+        return rotation_from_quat(self.quat_cam_from_world_wxyz)
+
+    def cam_from_world(self, xyz_world: FloatArray) -> FloatArray:
+        """Move (n, 3) points from the world to the camera frame, model units.
+
+        Notes
+        -----
+        In Eigen's order of operations (v + w u + q x u with u = 2 q x v): a point at 1e-10 units from the camera centre
+        then projects to where COLMAP projects it; a matrix product would round it elsewhere.
+        """
+        w, qx, qy, qz = self.quat_cam_from_world_wxyz
+        x, y, z = xyz_world.T
+        ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
+        ux, uy, uz = ux + ux, uy + uy, uz + uz
+        out = np.empty(xyz_world.shape)
+        out[:, 0] = x + w * ux + (qy * uz - qz * uy) + self.translation_cam_from_world[0]
+        out[:, 1] = y + w * uy + (qz * ux - qx * uz) + self.translation_cam_from_world[1]
+        out[:, 2] = z + w * uz + (qx * uy - qy * ux) + self.translation_cam_from_world[2]
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +206,7 @@ class SparseModel:
             table.name[image_idx],
             int(table.camera_id[image_idx]),
             None if camera_idx < 0 else self.camera(camera_idx),
-            rotation_from_quat(table.quat_cam_from_world_wxyz[image_idx]),
+            table.quat_cam_from_world_wxyz[image_idx],
             table.translation_cam_from_world[image_idx],
             int(table.num_points2d[image_idx]),
         )

@@ -1,0 +1,28 @@
+"""Where a camera sees a point, and how that moves with the point and with the camera's parameters.
+
+All 18 of COLMAP's models, on whole arrays. ``projection`` is the public face; ``warps`` holds the distortions of a
+plane, ``rational`` the models that distort the ray itself, ``fisheye`` the equidistant map before a distortion,
+``spherical`` the panorama, ``unprojection`` the way back from a pixel to its ray.
+"""
+
+from __future__ import annotations
+
+from audit.cameras.projection import (
+    Projection,
+    distorted_normalised,
+    is_fisheye,
+    normalised,
+    project,
+    project_with_jacobians,
+)
+from audit.cameras.unprojection import unproject
+
+__all__ = [
+    "Projection",
+    "distorted_normalised",
+    "is_fisheye",
+    "normalised",
+    "project",
+    "project_with_jacobians",
+    "unproject",
+]

@@ -1,0 +1,206 @@
+"""From points in the camera frame to pixels, with derivatives, for every camera model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from audit.cameras.columns import Plane, Want, in_front
+from audit.cameras.fisheye import angle_gain, fisheye_plane
+from audit.cameras.perspective import perspective_plane
+from audit.cameras.rational import RATIONAL_PLANES
+from audit.cameras.spherical import spherical_plane
+from audit.cameras.warps import WARPS
+from loaders.arrays import FloatArray, IntArray
+from loaders.camera_models import CameraModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """Projected points; row i of every array is the same point, and all of it is NaN where it does not project.
+
+    xy_px: (n, 2) px, distorted image, first pixel centre = (0.5, 0.5).
+    d_xy_d_cam: (n, 2, 3) px per model unit, d xy / d point in the camera frame.
+    d_xy_d_params: (n, 2, p) px per unit of each parameter, in COLMAP's parameter order; None when not asked for.
+    """
+
+    xy_px: FloatArray
+    d_xy_d_cam: FloatArray
+    d_xy_d_params: FloatArray | None
+
+
+def is_fisheye(model: CameraModel) -> bool:
+    """Whether ``model`` distorts the equidistant plane theta (X, Y) / rho instead of (X, Y) / Z."""
+    return model.name.endswith("FISHEYE")
+
+
+def project(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Project points, as COLMAP does.
+
+    Parameters
+    ----------
+    model : CameraModel
+    params : (p,)       in COLMAP's order, px and dimensionless
+    xyz_cam : (n, 3)    points in the camera frame, model units
+
+    Returns
+    -------
+    (n, 2)
+        px in the distorted image; NaN where pycolmap's ``Camera.img_from_cam`` gives no finite pixel: Zc below the
+        machine epsilon (all models but the division models and EQUIRECTANGULAR), outside the domain of a division
+        model or of EUCM, no direction at all (EQUIRECTANGULAR), overflow, points that are not finite.
+
+    Raises
+    ------
+    ValueError
+        when the shapes are not (p,) and (n, 3).
+
+    Notes
+    -----
+    METHOD.md section 1 asks of an inlier that Zc > 0 *and* a finite projection. The first is the caller's question:
+    a division model with k < 0 has finite projections of points behind the camera.
+
+    Source: COLMAP 4.2, src/colmap/sensor/models.h.
+    """
+    with np.errstate(all="ignore"):
+        plane = _plane(model, params, xyz_cam, Want.VALUE)
+        return _finite_px(model, params, plane)[0]
+
+
+def project_with_jacobians(
+    model: CameraModel, params: FloatArray, xyz_cam: FloatArray, *, with_params: bool = True
+) -> Projection:
+    """Project points, with analytic derivatives; see ``project`` for arguments, domain and errors.
+
+    ``with_params=False`` leaves out ``d_xy_d_params``, the dearer half.
+
+    Some points project and have no finite derivative: the poles of EQUIRECTANGULAR, the rim of a division model
+    (Z^2 = 4 k (X^2 + Y^2)), and points at infinity.
+    """
+    with np.errstate(all="ignore"):
+        plane = _plane(model, params, xyz_cam, Want.D_EXTRA if with_params else Want.D_POINT)
+        xy_px, lost = _finite_px(model, params, plane)
+        d_cam = _d_cam(model, params, plane)
+        d_params = _d_params(model, params, plane) if with_params else None
+    if lost is not None:
+        d_cam[lost] = np.nan
+        if d_params is not None:
+            d_params[lost] = np.nan
+    return Projection(xy_px, d_cam, d_params)
+
+
+def normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return the undistorted normalised point, METHOD.md section 5's u.
+
+    Parameters as in ``project``; ``params`` do not matter and are there so that the three functions look alike.
+
+    Returns
+    -------
+    (n, 2)
+        (X, Y) / Z, for fisheye models theta (X, Y) / rho; NaN where Zc is below the machine epsilon, and everywhere
+        for spherical models.
+    """
+    del params
+    if model.is_spherical:
+        return np.full((len(xyz_cam), 2), np.nan)
+    with np.errstate(all="ignore"):
+        xy = xyz_cam[:, :2] / in_front(xyz_cam[:, 2])[:, None]
+        if is_fisheye(model):
+            xy *= angle_gain((xy * xy).sum(axis=1))[:, None]
+    return xy
+
+
+def distorted_normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return ((x - cx) / fx, (y - cy) / fy) of the projected points, METHOD.md section 5's v.
+
+    Parameters as in ``project``. (n, 2), NaN where ``project`` is NaN, and everywhere for spherical models.
+    """
+    if model.is_spherical:
+        return np.full((len(xyz_cam), 2), np.nan)
+    with np.errstate(all="ignore"):
+        plane = _plane(model, params, xyz_cam, Want.VALUE)
+        _, lost = _finite_px(model, params, plane)
+    xy = np.column_stack([plane.x, plane.y])
+    if lost is not None:
+        xy[lost] = np.nan
+    return xy
+
+
+def scale_and_shift(model: CameraModel, params: FloatArray) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy (w, h, 0, 0 for spherical models), px."""
+    if model.is_spherical:
+        return float(params[0]), float(params[1]), 0.0, 0.0
+    focals, centre = model.focal_idxs, model.principal_point_idxs
+    return float(params[focals[0]]), float(params[focals[-1]]), float(params[centre[0]]), float(params[centre[1]])
+
+
+def extra_params(model: CameraModel, params: FloatArray) -> list[float]:
+    """Return the distortion parameters, in COLMAP's order."""
+    return [float(params[i]) for i in model.extra_idxs]
+
+
+def check_shapes(model: CameraModel, params: FloatArray, rows: FloatArray, width: int) -> None:
+    """Raise ValueError unless ``params`` fits ``model`` and ``rows`` is (n, width)."""
+    if params.shape != (model.num_params,):
+        raise ValueError(f"{model.name} has {model.num_params} parameters, got an array of shape {params.shape}")
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"expected points of shape (n, {width}), got {rows.shape}")
+
+
+def _plane(model: CameraModel, params: FloatArray, xyz_cam: FloatArray, want: Want) -> Plane:
+    """Return the points on the model's distorted normalised plane; spherical models: as shares of the image."""
+    check_shapes(model, params, xyz_cam, 3)
+    x, y, z = xyz_cam[:, 0], xyz_cam[:, 1], xyz_cam[:, 2]
+    if model.is_spherical:
+        return spherical_plane(x, y, z, want)
+    extra = extra_params(model, params)
+    if model.name in RATIONAL_PLANES:
+        return RATIONAL_PLANES[model.name](x, y, z, extra, want)
+    plane_of = fisheye_plane if is_fisheye(model) else perspective_plane
+    return plane_of(x, y, z, WARPS[model.name], extra, want=want)
+
+
+def _finite_px(model: CameraModel, params: FloatArray, plane: Plane) -> tuple[FloatArray, IntArray | None]:
+    """Return (n, 2) px, NaN where not finite, and the rows where it is not (None when there is none)."""
+    fx, fy, cx, cy = scale_and_shift(model, params)
+    xy_px = np.empty((len(plane.x), 2))
+    np.add(plane.x * fx, cx, out=xy_px[:, 0])
+    np.add(plane.y * fy, cy, out=xy_px[:, 1])
+    if math.isfinite(xy_px.sum()):
+        return xy_px, None
+    lost: IntArray = np.flatnonzero(~np.isfinite(xy_px).all(axis=1)).astype(np.int64)
+    xy_px[lost] = np.nan
+    return xy_px, lost
+
+
+def _d_cam(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
+    """Return (n, 2, 3) d px / d point."""
+    fx, fy, _, _ = scale_and_shift(model, params)
+    d_cam = np.empty((2, 3, len(plane.x)))
+    for axis in range(3):
+        np.multiply(plane.d_cam[axis], fx, out=d_cam[0, axis])
+        np.multiply(plane.d_cam[3 + axis], fy, out=d_cam[1, axis])
+    return _rows_first(d_cam)
+
+
+def _d_params(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
+    """Return (n, 2, p) d px / d params."""
+    fx, fy, _, _ = scale_and_shift(model, params)
+    d_params = np.empty((2, model.num_params, len(plane.x)))
+    d_params.fill(0.0)
+    focals = (0, 1) if model.is_spherical else model.focal_idxs
+    d_params[0, focals[0]] = plane.x
+    d_params[1, focals[-1]] = plane.y
+    for row, idx in enumerate(model.principal_point_idxs):
+        d_params[row, idx] = 1.0
+    for idx, (d_x, d_y) in zip(model.extra_idxs, plane.d_extra, strict=True):
+        np.multiply(d_x, fx, out=d_params[0, idx])
+        np.multiply(d_y, fy, out=d_params[1, idx])
+    return _rows_first(d_params)
+
+
+def _rows_first(columns: FloatArray) -> FloatArray:
+    """Return (2, p, n) as a contiguous (n, 2, p): one copy is half the price of writing into strided columns."""
+    return np.ascontiguousarray(columns.transpose(2, 0, 1))

@@ -1,0 +1,126 @@
+"""One run from PATHs to tables and a summary: what the verbs ``run`` and ``demo`` have in common."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from tqdm import tqdm
+
+from audit.cli.errors import ExitCode, KnownError
+from audit.config import AuditConfig
+from audit.runner import audit_many
+from loaders import Discovery, ModelRef, discover
+from loaders.input_state import input_size
+from reports.drawing import Page
+from reports.errors import OutputError, RunFolderError
+from reports.reader import RunReader
+from reports.store import RunSettings, RunStore
+from reports.summary import render_summary
+from reports.wording import plain
+
+_BYTES_WORTH_A_PROCESS: Final = 50_000_000  # of input: about a second of work, which is what a process costs
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a user asks for. jobs: number of processes, None for as many as there are CPUs and work for them."""
+
+    paths: Sequence[str]
+    folder: Path
+    config: AuditConfig
+    jobs: int | None = None
+    quiet: bool = False
+
+
+def run_audit(request: RunRequest) -> ExitCode:
+    """Audit what lies below the PATHs into a run folder; one line on stderr per input that cannot be read.
+
+    Raises
+    ------
+    KnownError
+        The run folder cannot be used or written.
+    """
+    start = time.perf_counter()
+    found = discover(request.paths)
+    problems = [(error.path, str(error)) for error in found.errors]
+    if found.refs:
+        try:
+            problems += _write_run(request, found, start)
+        except RunFolderError as error:
+            raise KnownError(str(error), ExitCode.USAGE) from error
+        except OutputError as error:
+            raise KnownError(str(error), ExitCode.OUTPUT) from error
+    for _, message in problems:
+        print(f"sfm-audit: {plain(message)}", file=sys.stderr)
+    return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
+
+
+def print_summary(folder: Path) -> None:
+    """Print the summary of a run folder."""
+    print_page(render_summary(RunReader.open(folder), terminal_page()))
+
+
+def print_page(text: str) -> None:
+    """Print to stdout in its own encoding; a reader that left, as ``head`` does, is no error."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
+
+
+def terminal_page() -> Page:
+    """Return how to draw on stdout: as wide as the terminal, 80 columns elsewhere."""
+    is_terminal = sys.stdout.isatty()
+    width = shutil.get_terminal_size((80, 24)).columns if is_terminal else 80
+    return Page(
+        width, (sys.stdout.encoding or "").lower().startswith("utf"), is_terminal and "NO_COLOR" not in os.environ
+    )
+
+
+def _write_run(request: RunRequest, found: Discovery, start: float) -> list[tuple[str, str]]:
+    problems = [(error.path, str(error)) for error in found.errors]
+    settings = RunSettings(
+        importlib.metadata.version("sfm-audit"),
+        request.config.model_dump(),
+        list(request.paths),
+        _paths_without_models(request.paths, found),
+    )
+    silent = request.quiet or not sys.stderr.isatty()
+    with RunStore(request.folder, settings) as store, tqdm(total=len(found.refs), unit="model", disable=silent) as bar:
+
+        def advance(_: ModelRef) -> None:
+            bar.update()
+
+        failures = audit_many(
+            found.refs,
+            request.config,
+            jobs=request.jobs or _sensible_jobs(found),
+            sink=store,
+            on_done=advance,
+        )
+        own = [(failure.location, failure.message) for failure in failures]
+        # a PATH that is not there today, such as a disk that is not mounted, does not cost the tables made from it
+        keep = None if found.errors else [ref.key for ref in found.refs]
+        store.finish(keep, [*problems, *own], time.perf_counter() - start)
+    return own
+
+
+def _paths_without_models(paths: Sequence[str], found: Discovery) -> frozenset[str]:
+    failed = {error.path for error in found.errors}
+    return frozenset(path for path in paths if path in failed)
+
+
+def _sensible_jobs(found: Discovery) -> int:
+    """Return one process per CPU, fewer where starting them costs more than they save."""
+    num_cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    num_bytes = sum(input_size(ref.location) for ref in found.refs)
+    return max(1, min(num_cpus, num_bytes // _BYTES_WORTH_A_PROCESS))

@@ -1,0 +1,70 @@
+"""The command ``sfm-audit``: its verbs, each imported when it is used, and what an error means for the exit code."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import Final, cast
+
+import click
+
+from audit.cli.errors import ExitCode, KnownError
+
+VERBS: Final = {
+    "run": "Audit reconstructions and write the tables into a run folder.",
+    "demo": "Audit simulated photos with planted defects; needs no data.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose verbs live in audit/cli/<verb>.py and are imported when they are called, not for --help."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the verbs in the order in which a newcomer meets them."""
+        del ctx
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one verb."""
+        del ctx
+        if cmd_name not in VERBS:
+            return None
+        return cast("click.Command", importlib.import_module(f"audit.cli.{cmd_name}").command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the verbs without importing them."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl(list(VERBS.items()))
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="sfm-audit", prog_name="sfm-audit", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Say which images of a structure-from-motion reconstruction to trust, and why not the others."""
+
+
+def main(args: Sequence[str]) -> int:
+    """Run one command and return its exit code; errors nobody expected keep their traceback."""
+    try:
+        code = cli.main(list(args) or ["--help"], prog_name="sfm-audit", standalone_mode=False)
+    except KnownError as error:
+        return _refuse(str(error), error.exit_code)
+    except click.Abort:
+        return _refuse("interrupted; what was finished stays, the same command goes on", ExitCode.INTERRUPTED)
+    except click.ClickException as error:
+        context = getattr(error, "ctx", None)
+        advice = f" (see {context.command_path} --help)" if context else ""
+        return _refuse(error.format_message() + advice, ExitCode.USAGE)
+    return int(code or 0)
+
+
+def entry_point() -> None:
+    """Run the command that the shell gave."""
+    sys.exit(main(sys.argv[1:]))
+
+
+def _refuse(message: str, exit_code: ExitCode) -> int:
+    click.echo(f"sfm-audit: {' '.join(message.split())}", err=True)
+    return int(exit_code)

@@ -1,0 +1,158 @@
+"""How large is the noise of one image? Robust variance fits (METHOD.md section 2, (1); the paper's P5, P9 to P12)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from loaders.arrays import FloatArray
+
+CUTOFF = 2.0  # c: residuals beyond two standard deviations count as if they were there
+
+
+def consistency(cutoff: float) -> float:
+    """Return kappa = E min(z^2, c^2) for z ~ N(0, 1), which makes the winsorised scale consistent."""
+    tail = 0.5 * math.erfc(cutoff / math.sqrt(2.0))
+    density = math.exp(-0.5 * cutoff**2) / math.sqrt(2.0 * math.pi)
+    return 1.0 - 2.0 * tail - 2.0 * cutoff * density + 2.0 * cutoff**2 * tail
+
+
+CONSISTENCY = consistency(CUTOFF)  # kappa = 0.92053...
+_NORMAL_MEDIAN_SQ = 0.4549364  # median of chi^2(1)
+_RELATIVE_CHANGE = 1e-8
+_MAX_ITERATIONS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceFit:
+    """theta of (1): var = detector_px2 + structure * a^2, both px^2 and >= 0; NaN where undetermined.
+
+    converged: False when the iteration ended in a cycle (then the last two iterates are averaged).
+    """
+
+    detector_px2: float
+    structure: float
+    converged: bool
+
+
+UNDETERMINED = VarianceFit(math.nan, math.nan, converged=False)
+
+
+def fit_constant_variance(sq_residuals_px2: FloatArray) -> VarianceFit:
+    """Fit one variance to squared residuals of any shape, robustly, consistent at the normal.
+
+    Notes
+    -----
+    The fixed point of METHOD.md section 2's Fisher scoring with a = 0 is the root of
+    mean(min(y / theta, c^2)) = kappa. In u = 1 / theta the left side is increasing, concave and piecewise linear, so
+    Newton from below reaches the root exactly after finitely many steps. All y = 0: undetermined.
+    """
+    y = sq_residuals_px2.ravel()
+    n = y.size
+    if n == 0 or not np.isfinite(total := float(y.sum())) or total == 0.0:
+        return UNDETERMINED
+    theta = float(np.median(y)) / _NORMAL_MEDIAN_SQ
+    if theta <= 0.0 or np.count_nonzero(y >= CUTOFF**2 * theta) * CUTOFF**2 >= 0.5 * n * CONSISTENCY:
+        theta = total / (n * CONSISTENCY)  # below the root in u, where Newton cannot overshoot
+    for _ in range(_MAX_ITERATIONS):
+        inside = y < CUTOFF**2 * theta
+        num_clipped = n - int(np.count_nonzero(inside))
+        unclipped_sum = float(np.dot(y, inside))
+        denominator = n * CONSISTENCY - num_clipped * CUTOFF**2
+        if (
+            denominator <= 0.0 or unclipped_sum == 0.0
+        ):  # more than kappa / c^2 of y are positive outliers of a zero bulk
+            return UNDETERMINED
+        previous, theta = theta, unclipped_sum / denominator
+        if abs(theta - previous) <= 1e-14 * theta:
+            return VarianceFit(theta, 0.0, converged=True)
+    return VarianceFit(theta, 0.0, converged=False)
+
+
+def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> VarianceFit:
+    """Fit var = theta_1 + theta_2 a^2 (1) robustly, theta >= 0.
+
+    Parameters
+    ----------
+    sq_residuals_px2 : (m,) y, squared residuals of single axes, px^2
+    predictor_px2 : (m,) a^2 of the same axis, px^2, finite and >= 0
+
+    Notes
+    -----
+    METHOD.md section 2: Fisher scoring on winsorised squares. Its fixed points solve
+    sum A_j (min(y_j / s_j, c^2) / kappa - 1) / s_j = 0 with s = A theta, or have theta_2 = 0 and a non-positive second
+    component. The boundaries theta_2 = 0 and theta_1 = 0 are tried first (both are common, and there the equation is
+    that of a constant), then Newton with scoring steps where Newton leaves the region. Where the paper says IRLS
+    without naming weights, this is our choice; METHOD.md says why.
+    """
+    constant = fit_constant_variance(sq_residuals_px2)
+    if not constant.converged or not predictor_px2.any():
+        return constant
+    theta = np.array([constant.detector_px2, 0.0])
+    equation, _ = _estimating_equation(sq_residuals_px2, predictor_px2, theta)
+    if equation[1] <= 0.0:
+        return constant
+    if predictor_px2.min() > 0.0:
+        proportional = fit_constant_variance(sq_residuals_px2 / predictor_px2)
+        edge = np.array([0.0, proportional.detector_px2])
+        if proportional.converged and _estimating_equation(sq_residuals_px2, predictor_px2, edge)[0][0] <= 0.0:
+            return VarianceFit(0.0, proportional.detector_px2, converged=True)
+    previous = theta
+    for _ in range(_MAX_ITERATIONS):
+        previous, theta = theta, _next_theta(sq_residuals_px2, predictor_px2, theta)
+        scale, old = _variance(predictor_px2, theta), _variance(predictor_px2, previous)
+        if np.all(np.abs(scale - old) <= _RELATIVE_CHANGE * old):
+            return VarianceFit(float(theta[0]), float(theta[1]), converged=True)
+    theta = 0.5 * (theta + previous)
+    return VarianceFit(float(theta[0]), float(theta[1]), converged=False)
+
+
+def _variance(predictor: FloatArray, theta: FloatArray) -> FloatArray:
+    return np.asarray(theta[0] + theta[1] * predictor, dtype=np.float64)
+
+
+def _estimating_equation(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Left side (2,) of the estimating equation and its derivative (2, 2) in theta."""
+    s = _variance(predictor, theta)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = y / s
+    ratio = np.where(s > 0, ratio, np.where(y > 0, np.inf, 1.0))
+    s = np.maximum(s, np.finfo(np.float64).tiny)
+    inside = ratio < CUTOFF**2
+    excess = np.minimum(ratio, CUTOFF**2) / CONSISTENCY - 1.0
+    first = excess / s
+    slope = -(first + np.where(inside, ratio, 0.0) / (CONSISTENCY * s)) / s
+    cross = float(slope @ predictor)
+    derivative = np.array([[slope.sum(), cross], [cross, slope @ (predictor * predictor)]])
+    return np.array([first.sum(), first @ predictor]), derivative
+
+
+def _next_theta(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:
+    """One Newton step if it stays inside theta > 0, else one Fisher scoring step with non-negative least squares."""
+    equation, derivative = _estimating_equation(y, predictor, theta)
+    determinant = derivative[0, 0] * derivative[1, 1] - derivative[0, 1] ** 2
+    if determinant > 0 and derivative[0, 0] < 0:  # Newton only near the root; from theta_2 = 0 never
+        newton = theta - np.linalg.solve(derivative, equation)
+        if np.all(newton > 0.1 * theta) and np.all(newton < 10.0 * theta):
+            return np.asarray(newton)
+    return scoring_step(y, predictor, theta)
+
+
+def scoring_step(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:
+    """One step of METHOD.md section 2 as it is written: winsorised pseudo-responses, rows weighted 1 / s, NNLS."""
+    s = _variance(predictor, theta)
+    positive = s > 0
+    s, y, a = s[positive], y[positive], predictor[positive]
+    weight = 1.0 / (s * s)
+    response = np.minimum(y / s, CUTOFF**2) / CONSISTENCY * s
+    gram = np.array([[weight.sum(), weight @ a], [weight @ a, weight @ (a * a)]])
+    right = np.array([weight @ response, (weight * a) @ response])
+    free = np.linalg.solve(gram, right) if np.linalg.det(gram) > 0 else np.array([-1.0, -1.0])
+    if free.min() >= 0:
+        return np.asarray(free)
+    edges = [np.array([right[0] / gram[0, 0], 0.0])]
+    if gram[1, 1] > 0:
+        edges.append(np.array([0.0, right[1] / gram[1, 1]]))
+    return min(edges, key=lambda t: float(t @ gram @ t - 2 * right @ t))

@@ -1,0 +1,153 @@
+"""From what is known about images and models to the rows of their tables (columns: audit/table.py)."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from audit.coverage import coverage, occupied_cells
+from audit.image_audit import ImageAudit
+from audit.standardise import ModelTracks
+from audit.stored_errors import StoredErrors
+from audit.table import ModelLabels
+from audit.verdict import Judgement, Verdict
+from loaders.model import Finding, SparseModel
+
+Row = dict[str, object]
+
+
+def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str, grid: int) -> Row:
+    """Return the row of one image; ``ks_q`` needs all rows of the model and is left NaN."""
+    inliers, image, camera = audit.inliers, audit.image, audit.image.camera
+    num_inliers = len(inliers.xy_px)
+    width, height = (camera.width, camera.height) if camera else (0, 0)
+    lost = inliers.num_behind + inliers.num_nonfinite + inliers.num_dangling
+    return {
+        **asdict(labels),
+        "image_id": image.image_id,
+        "image_name": image.name,
+        "camera_id": image.camera_id,
+        "camera_model": camera.model.name if camera else None,
+        "width": camera.width if camera else None,
+        "height": camera.height if camera else None,
+        "params": camera.params if camera else None,
+        "num_points2d": image.num_points2d,
+        "num_linked": num_inliers + lost,
+        "num_inliers": num_inliers,
+        "num_behind": inliers.num_behind,
+        "num_nonfinite": inliers.num_nonfinite,
+        "num_dangling": inliers.num_dangling,
+        "num_unverifiable": num_inliers - len(audit.noise.z),
+        "num_standardised": len(audit.noise.z),
+        "mean_track_length": math.nan if audit.track_length is None or not num_inliers else audit.track_length.mean(),
+        "coverage": coverage(inliers.xy_px, width, height),
+        "occupied_cells": occupied_cells(inliers.xy_px, width, height, grid),
+        **_error_summary(audit),
+        "noise_model": noise_name,
+        **_noise_columns(audit),
+        **_test_columns(audit),
+        "pose_offset_px": audit.pose_offset_px,
+        "verdict": str(audit.verdict),
+        "verdict_ks": str(audit.ks.verdict),
+        "reasons": [str(reason) for reason in audit.judgement.reasons],
+    }
+
+
+def _error_summary(audit: ImageAudit) -> Row:
+    """Reprojection errors of the inliers, px."""
+    names = ("rms_px", "mean_px", "median_px", "p95_px", "max_px")
+    if not len(audit.residuals_px):
+        return dict.fromkeys(names, math.nan)
+    sq = (audit.residuals_px**2).sum(axis=1)
+    error = np.sqrt(np.sort(sq))
+    values = (
+        math.sqrt(sq.mean()),
+        error.mean(),
+        _sorted_quantile(error, 0.5),
+        _sorted_quantile(error, 0.95),
+        error[-1],
+    )
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def _sorted_quantile(ascending: np.ndarray[tuple[int], np.dtype[np.float64]], q: float) -> float:
+    """Linear interpolation between order statistics, as numpy.quantile's default."""
+    position = q * (len(ascending) - 1)
+    low = int(position)
+    high = min(low + 1, len(ascending) - 1)
+    return float(ascending[low] + (position - low) * (ascending[high] - ascending[low]))
+
+
+def _noise_columns(audit: ImageAudit) -> Row:
+    noise = audit.noise
+    return {
+        "sigma_constant_px": audit.constant.sigma_constant_px,
+        "sigma_d_px": noise.sigma_d_px,
+        "sigma_l": noise.sigma_l,
+        "sigma_predicted_px": noise.sigma_predicted_px,
+        "scale_ratio": noise.scale_ratio,
+        "noise_converged": noise.converged if len(noise.z) else None,
+    }
+
+
+def _test_columns(audit: ImageAudit) -> Row:
+    tests, constant = audit.tests, audit.constant_tests
+    return {
+        "ks_stat": tests.ks_stat,
+        "ks_p": tests.ks_p,
+        "ks_q": math.nan,
+        "ks_fitted_p": tests.ks_fitted_p,
+        "ks_norm_p": tests.ks_norm_p,
+        "ks_norm_unscaled_p": tests.ks_norm_unscaled_p,
+        "dap_stat": tests.dap_stat,
+        "dap_p": tests.dap_p,
+        "sw_stat": tests.sw_stat,
+        "sw_p": tests.sw_p,
+        "skewness": tests.skewness,
+        "kurtosis_excess": tests.kurtosis_excess,
+        "ks_constant_stat": constant.ks_stat,
+        "ks_constant_p": constant.ks_p,
+        "ks_fitted_constant_p": constant.ks_fitted_p,
+        "ks_norm_constant_p": constant.ks_norm_p,
+        "dap_constant_p": constant.dap_p,
+        "sw_constant_p": constant.sw_p,
+        "skewness_constant": constant.skewness,
+        "kurtosis_constant": constant.kurtosis_excess,
+    }
+
+
+def model_row(
+    model: SparseModel,
+    labels: ModelLabels,
+    tracks: ModelTracks,
+    errors: StoredErrors,
+    findings: Sequence[Finding],
+    judgements: Sequence[tuple[Judgement, Judgement]],
+) -> Row:
+    """Return the row of one model; ``judgements`` holds each image's (policy, ks)."""
+    total_sq = tracks.statistics.total_sq_px2
+    policy = Counter(pair[0].verdict for pair in judgements)
+    ks = Counter(pair[1].verdict for pair in judgements)
+    return {
+        **asdict(labels),
+        "file_format": model.file_format,
+        "num_cameras": len(model.cameras),
+        "num_images": len(model.images),
+        "num_points3d": len(model.points),
+        "num_observations": len(model.observations),
+        "stored_error_px": errors.stored_mean_px,
+        "recomputed_point_error_px": errors.recomputed_mean_px,
+        "recomputed_observation_error_px": errors.recomputed_observation_mean_px,
+        "share_stale_point_errors": errors.share_stale,
+        "noise_nu0": tracks.prior.nu0,
+        "noise_s0_px": tracks.prior.s0_px,
+        "removable_share": tracks.statistics.removable_sq_px2 / total_sq if total_sq > 0 else math.nan,
+        "num_nonstationary_images": int(np.count_nonzero(tracks.nonstationary)),
+        **{f"num_{verdict}": policy[verdict] for verdict in Verdict},
+        **{f"num_{verdict}_ks": ks[verdict] for verdict in Verdict},
+        "findings": list(findings),
+    }

@@ -1,0 +1,182 @@
+"""What do the result tables hold? Name, type, unit and meaning of every column; nothing else in the project knows them.
+
+``docs/tables.md`` is made from this file by ``scripts/make_docs_tables.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import pyarrow as pa
+
+from audit.arrow import build_table
+
+__all__ = ["IMAGES", "MODELS", "TABLES", "Column", "ModelLabels", "TableName", "build_table", "empty_table", "schema"]
+
+TableName = Literal["images", "models"]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: ``unit`` is px, count, id, text, bool, or 1 for a pure number; ``meaning`` is one line for people."""
+
+    name: str
+    type: pa.DataType
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModelLabels:
+    """The four text columns that say which model a row belongs to (docs/tables.md)."""
+
+    dataset: str
+    scene: str
+    component: str
+    model_path: str
+
+
+def _text(name: str, meaning: str) -> Column:
+    return Column(name, pa.string(), "text", meaning)
+
+
+def _list_of(kind: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.field("element", kind))  # Parquet's name for it: what is read equals what was written
+
+
+def _texts(name: str, meaning: str) -> Column:
+    return Column(name, _list_of(pa.string()), "text", meaning)
+
+
+def _id(name: str, meaning: str) -> Column:
+    return Column(name, pa.uint32(), "id", meaning)
+
+
+def _count(name: str, meaning: str) -> Column:
+    return Column(name, pa.int64(), "count", meaning)
+
+
+def _bool(name: str, meaning: str) -> Column:
+    return Column(name, pa.bool_(), "bool", meaning)
+
+
+def _px(name: str, meaning: str) -> Column:
+    return Column(name, pa.float64(), "px", meaning)
+
+
+def _number(name: str, meaning: str) -> Column:
+    return Column(name, pa.float64(), "1", meaning)
+
+
+_IDENTITY: Final = (
+    _text("dataset", "base name of the PATH that was given"),
+    _text("scene", "scene the model belongs to; base name of a bare model folder"),
+    _text("component", "which of the scene's models; 0 for a bare model folder"),
+    _text("model_path", "location of the model as given, joined with the path below it"),
+)
+
+IMAGES: Final[tuple[Column, ...]] = (
+    *_IDENTITY,
+    _id("image_id", "id as stored"),
+    _text("image_name", "name as stored"),
+    _id("camera_id", "id as stored"),
+    _text("camera_model", "COLMAP's name of the camera model; null when the model has no such camera"),
+    Column("width", pa.uint32(), "px", "image width as stored with the camera"),
+    Column("height", pa.uint32(), "px", "image height as stored with the camera"),
+    Column("params", _list_of(pa.float64()), "px and 1", "camera parameters as stored, in COLMAP's order"),
+    _count("num_points2d", "all 2D points of the image, linked or not"),
+    _count("num_linked", "2D points with a 3D point id = num_inliers + num_behind + num_nonfinite + num_dangling"),
+    _count("num_inliers", "observations that enter the audit (point exists, before the camera, finite projection)"),
+    _count("num_behind", "linked points behind the camera"),
+    _count("num_nonfinite", "linked points whose projection is not finite"),
+    _count("num_dangling", "2D points that name a 3D point the model does not have"),
+    _count("num_unverifiable", "inliers that their own track cannot verify (audited length < 3 or leverage too high)"),
+    _count("num_standardised", "observations that enter the tests, x and y each = num_inliers - num_unverifiable"),
+    _number("mean_track_length", "mean audited track length over the inliers"),
+    _number("coverage", "area of the convex hull of the observed inliers / image area, not clipped"),
+    _count("occupied_cells", "cells with at least one inlier, of a grid over the image (8 x 8 unless configured)"),
+    _px("rms_px", "root mean square reprojection error, sqrt(mean |eps|^2), over the inliers"),
+    _px("mean_px", "mean reprojection error |eps| over the inliers"),
+    _px("median_px", "median reprojection error |eps| over the inliers"),
+    _px("p95_px", "95th percentile of the reprojection error |eps| over the inliers"),
+    _px("max_px", "largest reprojection error |eps| among the inliers"),
+    _text("noise_model", "noise model behind z: track or constant"),
+    _px("sigma_constant_px", "robust noise per axis of the raw residuals, one value for the whole image"),
+    _px("sigma_d_px", "detector noise per axis, sqrt(theta_1) of the paper's model on whitened residuals"),
+    _number("sigma_l", "share of the rest of the track's noise, sqrt(theta_2) of the paper's model"),
+    _px("sigma_predicted_px", "median predicted noise per axis of the image's observations"),
+    _number("scale_ratio", "observed / predicted noise variance; below 1 over-fitted, above 1 under-fitted"),
+    _bool("noise_converged", "whether the robust fits of the noise converged"),
+    _number("ks_stat", "Kolmogorov-Smirnov distance of z from N(0, 1)"),
+    _number("ks_p", "p-value of ks_stat; the paper's decision is at 0.05"),
+    _number("ks_q", "Benjamini-Hochberg q-value of ks_p over the model's images"),
+    _number("ks_fitted_p", "p-value of the same distance after centring and scaling z (Lilliefors' null)"),
+    _number("ks_norm_p", "p-value of |z|^2 against the Rayleigh law, scale fitted (Lilliefors' exponential null)"),
+    _number("ks_norm_unscaled_p", "p-value of |z|^2 / 2 against Exp(1), z of the paper's noise model, nothing fitted"),
+    _number("dap_stat", "D'Agostino-Pearson statistic of z"),
+    _number("dap_p", "p-value of dap_stat"),
+    _number("sw_stat", "Shapiro-Wilk statistic of z, at most 5000 values (every k-th observation above that)"),
+    _number("sw_p", "p-value of sw_stat"),
+    _number("skewness", "skewness of z; 0 for a normal"),
+    _number("kurtosis_excess", "excess kurtosis of z; 0 for a normal, positive for heavy tails"),
+    _number("ks_constant_stat", "Kolmogorov-Smirnov distance under the constant noise model"),
+    _number("ks_constant_p", "p-value of ks_constant_stat"),
+    _number("ks_fitted_constant_p", "ks_fitted_p under the constant noise model"),
+    _number("ks_norm_constant_p", "ks_norm_p under the constant noise model"),
+    _number("dap_constant_p", "dap_p under the constant noise model"),
+    _number("sw_constant_p", "sw_p under the constant noise model"),
+    _number("skewness_constant", "skewness under the constant noise model"),
+    _number("kurtosis_constant", "excess kurtosis under the constant noise model"),
+    _px("pose_offset_px", "RMS residual that a change of this image's pose alone would remove; ~0 after adjustment"),
+    _text("verdict", "accepted, rejected or undetermined under the policy of the run"),
+    _text("verdict_ks", "rejected when ks_p < alpha; undetermined with too few standardised observations"),
+    _texts("reasons", "why not accepted: code, colon, and the number that triggered it"),
+)
+
+_FINDING: Final = pa.struct([("code", pa.string()), ("count", pa.int64()), ("text", pa.string())])
+
+MODELS: Final[tuple[Column, ...]] = (
+    *_IDENTITY,
+    _text("file_format", "binary or text"),
+    _count("num_cameras", "cameras in the model, used or not"),
+    _count("num_images", "registered images"),
+    _count("num_points3d", "3D points"),
+    _count("num_observations", "linked 2D points of all images"),
+    _px("stored_error_px", "mean of the reprojection errors stored with the 3D points"),
+    _px("recomputed_point_error_px", "the same mean over points, recomputed"),
+    _px("recomputed_observation_error_px", "mean recomputed reprojection error over observations"),
+    _number(
+        "share_stale_point_errors",
+        "share of points whose stored error differs from the recomputed one by more than 1e-3 px and 0.1 %",
+    ),
+    _number("noise_nu0", "degrees of freedom of the spread of noise between tracks; large = all tracks alike"),
+    _px("noise_s0_px", "typical noise of a track per axis"),
+    _number("removable_share", "share of the squared residuals that moving the 3D points alone would remove"),
+    _count("num_nonstationary_images", "images with a pose_offset_px above the threshold"),
+    _count("num_accepted", "images whose verdict is accepted"),
+    _count("num_rejected", "images whose verdict is rejected"),
+    _count("num_undetermined", "images whose verdict is undetermined"),
+    _count("num_accepted_ks", "images whose verdict_ks is accepted"),
+    _count("num_rejected_ks", "images whose verdict_ks is rejected"),
+    _count("num_undetermined_ks", "images whose verdict_ks is undetermined"),
+    Column("findings", _list_of(_FINDING), "text", "inconsistencies of the model: code, how many items, one line each"),
+)
+
+TABLES: Final[dict[TableName, tuple[Column, ...]]] = {"images": IMAGES, "models": MODELS}
+
+
+def schema(table: TableName) -> pa.Schema:
+    """Return the Arrow schema of a table; each field's metadata holds its unit and meaning."""
+    return pa.schema(
+        [
+            pa.field(column.name, column.type, metadata={"unit": column.unit, "meaning": column.meaning})
+            for column in TABLES[table]
+        ]
+    )
+
+
+def empty_table(table: TableName) -> pa.Table:
+    """Return a table without rows."""
+    wanted = schema(table)
+    return build_table({name: [] for name in wanted.names}, wanted)

@@ -1,0 +1,280 @@
+"""How does a run reach the disk so that a killed one can go on? One Parquet part per model and table, and run.json.
+
+A part is written under a temporary name, flushed to the disk and renamed. The part in ``models`` comes last and is the
+mark that the model is finished: a model without it is audited again. docs/decisions/0002-run-folder.md says which
+commands may write into an existing folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from filelock import FileLock, Timeout
+
+from loaders.discover import ModelRef
+from loaders.input_state import InputState
+from reports.errors import OutputError, RunFolderError
+
+TOOL: Final = "sfm-audit"
+TABLES: Final = ("images", "models")  # in the order in which a model's parts are written
+METADATA_KEY: Final = b"sfm_audit"
+COUNTED: Final = ("num_images", "num_accepted", "num_rejected", "num_undetermined")
+_OWN_FILES: Final = frozenset({"run.json", ".lock", *TABLES})
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """What a run folder is bound to: the tool's version, the config, and the PATHs of the command.
+
+    empty_paths: those of ``paths`` in which no model was found; a folder is not bound to them.
+    """
+
+    version: str
+    config: Mapping[str, Any]
+    paths: Sequence[str]
+    empty_paths: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What a finished model says about itself in the metadata of its parts."""
+
+    version: str
+    config: Mapping[str, Any]
+    labels: Mapping[str, str]
+    state: InputState
+    counts: Mapping[str, int]
+    seconds: float
+
+
+class RunStore:
+    """An open run folder; one process at a time.
+
+    Use as a context manager. Methods raise OutputError when the operating system refuses to write; parts that were
+    finished before stay.
+    """
+
+    def __init__(self, folder: Path, settings: RunSettings) -> None:
+        self.folder = folder
+        self._settings = settings
+        self._paths: list[dict[str, str]] = []
+        self._parts: dict[str, _Part] = {}
+        self._lock = FileLock(folder / ".lock", timeout=0)
+
+    def __enter__(self) -> Self:
+        """Lock the folder and make it ready.
+
+        Raises
+        ------
+        RunFolderError
+            The folder is in use, holds another run, or is not a run folder.
+        OutputError
+            It cannot be made or written.
+        """
+        _refuse_foreign_folder(self.folder)
+        with _writing(self.folder):
+            for name in TABLES:
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+        self._acquire()
+        try:
+            self._paths = self._bind()
+            self._remove_temporary_files()
+            self._write_run_json("running", {})
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Let other runs in; what was written stays."""
+        self._lock.release()
+
+    def finished(self, ref: ModelRef) -> InputState | None:
+        """Return the input a model was finished with, or None when this run has to audit it."""
+        part = _read_part(self._path("models", ref.key))
+        if part is None or not self._path("images", ref.key).exists():
+            return None
+        if (part.version, part.config, part.labels) != (self._settings.version, self._config(), _labels(ref)):
+            return None
+        self._parts[ref.key] = part
+        return part.state
+
+    def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
+        """Write the parts of one model; the ``models`` part, which has one row, last."""
+        self.drop(ref.key)
+        row = tables["models"].select(list(COUNTED))
+        counts = {name: int(row[name][0].as_py()) for name in COUNTED}
+        part = _Part(self._settings.version, self._config(), _labels(ref), state, counts, seconds)
+        metadata = {METADATA_KEY: json.dumps(asdict(part)).encode()}
+        for name in TABLES:
+            buffer = pa.BufferOutputStream()
+            pq.write_table(tables[name].replace_schema_metadata(metadata), buffer)
+            _write_atomically(self._path(name, ref.key), buffer.getvalue().to_pybytes())
+        self._parts[ref.key] = part
+
+    def drop(self, key: str) -> None:
+        """Remove a model's parts, its mark of being finished first."""
+        self._parts.pop(key, None)
+        for name in reversed(TABLES):
+            path = self._path(name, key)
+            with _writing(path):
+                path.unlink(missing_ok=True)
+
+    def finish(self, keep: Iterable[str] | None, failures: Sequence[tuple[str, str]], seconds: float) -> None:
+        """Complete run.json, after removing all models but those in ``keep`` (None: remove nothing).
+
+        failures: (model path or PATH, message).    seconds: how long the run took.
+        """
+        if keep is not None:
+            wanted = set(keep)
+            for path in sorted((self.folder / "models").glob("part-*.parquet")):
+                key = path.stem.removeprefix("part-")
+                if key not in wanted:
+                    self.drop(key)
+        totals = {name: sum(part.counts[name] for part in self._parts.values()) for name in COUNTED}
+        content = {
+            "counts": {"num_models": len(self._parts), **totals, "num_failures": len(failures)},
+            "failures": [{"location": location, "message": message} for location, message in failures],
+            "seconds": round(seconds, 3),
+            "inputs": [
+                {
+                    **part.labels,
+                    "part": f"part-{key}.parquet",
+                    "num_bytes": part.state.num_bytes,
+                    "sha256": part.state.digest,
+                    "seconds": round(part.seconds, 3),
+                }
+                for key, part in sorted(self._parts.items(), key=lambda item: item[1].labels["model_path"])
+            ],
+        }
+        self._write_run_json("complete", content)
+
+    def _path(self, table: str, key: str) -> Path:
+        return self.folder / table / f"part-{key}.parquet"
+
+    def _acquire(self) -> None:
+        try:
+            self._lock.acquire()
+        except Timeout:  # an OSError too, so it stands first
+            raise RunFolderError(self.folder, "another run is writing here", "wait, or choose another -o") from None
+        except OSError as error:
+            raise OutputError(self.folder, error.strerror or str(error)) from error
+
+    def _config(self) -> dict[str, Any]:
+        return dict(self._settings.config)
+
+    def _bind(self) -> list[dict[str, str]]:
+        """Refuse a folder that holds another run; return the PATHs that it is bound to from now on."""
+        old = _read_run_json(self.folder) or {"config": self._config(), "paths": []}
+        mine = self._config()
+        for name in sorted({*old["config"], *mine}):
+            if old["config"].get(name) != mine.get(name):
+                problem = f"holds a run with {name} = {old['config'].get(name)}, not {mine.get(name)}"
+                raise RunFolderError(self.folder, problem, "choose another -o, or remove the folder")
+        named = {os.path.realpath(path): path for path in self._settings.paths}
+        bound = {path["real"]: path["given"] for path in old["paths"]}
+        lost = [given for real, given in bound.items() if real not in named]
+        if lost:
+            problem = f"holds a run over {lost[0]}, which this command leaves out"
+            raise RunFolderError(self.folder, problem, "name that PATH too, choose another -o, or remove the folder")
+        return [
+            {"given": given, "real": real}
+            for real, given in named.items()
+            if given not in self._settings.empty_paths or real in bound
+        ]
+
+    def _remove_temporary_files(self) -> None:
+        with _writing(self.folder):
+            for folder in (self.folder, *(self.folder / name for name in TABLES)):
+                for path in folder.glob(".tmp-*"):
+                    path.unlink()
+
+    def _write_run_json(self, status: str, content: Mapping[str, Any]) -> None:
+        settings = self._settings
+        head = {"tool": TOOL, "version": settings.version, "status": status}
+        bound = {"config": self._config(), "paths": self._paths}
+        text = json.dumps({**head, **bound, **content}, indent=1)
+        _write_atomically(self.folder / "run.json", text.encode())
+
+
+def _labels(ref: ModelRef) -> dict[str, str]:
+    return {"dataset": ref.dataset, "scene": ref.scene, "component": ref.component, "model_path": ref.model_path}
+
+
+def _refuse_foreign_folder(folder: Path) -> None:
+    if not folder.is_dir() or (folder / "run.json").exists():
+        return
+    with _writing(folder):
+        names = sorted(path.name for path in folder.iterdir())
+    foreign = [name for name in names if name not in _OWN_FILES and not name.startswith(".tmp-")]
+    if foreign:
+        problem = f"is not a run folder and not empty ({foreign[0]!r} is in it)"
+        raise RunFolderError(folder, problem, "choose a new folder with -o")
+
+
+def _read_run_json(folder: Path) -> dict[str, Any] | None:
+    path = folder / "run.json"
+    try:
+        content = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        content = None
+    if not isinstance(content, dict) or content.get("tool") != TOOL or not {"config", "paths"} <= content.keys():
+        raise RunFolderError(folder, "its run.json was not written by sfm-audit", "choose a new folder with -o")
+    return content
+
+
+def _read_part(path: Path) -> _Part | None:
+    """Return what a part says about itself; None when it is missing or not one of ours."""
+    try:
+        metadata = pq.read_metadata(path).metadata or {}
+        fields = json.loads(metadata[METADATA_KEY])
+        return _Part(**{**fields, "state": InputState(**fields["state"])})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    temporary = path.with_name(f".tmp-{path.name}")
+    with _writing(path):
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        _flush_folder(path.parent)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make a rename survive a power cut; Windows has no such call for folders."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(path, error.strerror or str(error)) from error

@@ -1,0 +1,126 @@
+"""Damaged files: a LoadError, or a model and its findings; no part of a model in silence, no other exception."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from model_writer import binary_files, rig_model, text_files, write_binary, write_text
+
+from loaders import FindingCode, LoadError, SparseModel, open_model
+
+BINARY, TEXT = binary_files(rig_model()), text_files(rig_model())
+HAND_WRITTEN = text_files(rig_model(), header=False)
+DAMAGE = settings(
+    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+
+
+@pytest.mark.parametrize("name", BINARY)
+def test_a_binary_file_cut_at_any_byte_is_refused(tmp_path: Path, name: str):
+    write_binary(tmp_path, rig_model())
+    for length in range(len(BINARY[name])):
+        (tmp_path / name).write_bytes(BINARY[name][:length])
+        with pytest.raises(LoadError) as error:
+            open_model(tmp_path)
+        assert error.value.path == str(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", sorted(set(TEXT) - {"cameras.txt"}))
+def test_a_text_file_that_states_its_count_cut_at_any_byte_is_refused(tmp_path: Path, name: str):
+    write_text(tmp_path, rig_model())
+    for length in range(len(TEXT[name])):
+        (tmp_path / name).write_bytes(TEXT[name][:length])
+        with pytest.raises(LoadError):
+            open_model(tmp_path)
+
+
+def test_cameras_cut_in_the_last_number_are_a_finding_and_cut_before_it_refused(tmp_path: Path):
+    """People edit cameras.txt and leave its last line unended; so a cut in its very last number can only be told."""
+    write_text(tmp_path, rig_model())
+    content = TEXT["cameras.txt"]
+    last_number = content.rindex(b" ") + 1
+    for length in range(len(content)):
+        (tmp_path / "cameras.txt").write_bytes(content[:length])
+        if length <= last_number:
+            with pytest.raises(LoadError):
+                open_model(tmp_path)
+        else:
+            assert FindingCode.UNTERMINATED_TEXT in {finding.code for finding in open_model(tmp_path).findings}
+
+
+@pytest.mark.parametrize("name", HAND_WRITTEN)
+def test_without_a_stated_count_a_cut_is_refused_or_told(tmp_path: Path, name: str):
+    """Cut between two lines such a file is a valid file: what it lacks shows where the other files refer to it."""
+    write_text(tmp_path, rig_model(), header=False)
+    (tmp_path / name).write_bytes(HAND_WRITTEN[name])
+    assert open_model(tmp_path).findings == ()
+    for length in range(len(HAND_WRITTEN[name])):
+        (tmp_path / name).write_bytes(HAND_WRITTEN[name][:length])
+        try:
+            model = open_model(tmp_path)
+        except LoadError:
+            continue
+        assert model.findings, f"{name} cut at {length} is read without a word"
+
+
+def assert_is_a_model(model: SparseModel) -> None:
+    """The promises that the audit relies on."""
+    images, observations = model.images, model.observations
+    assert bool(np.all(np.diff(images.image_id.astype(np.int64)) > 0))
+    assert bool(np.all(np.diff(model.cameras.camera_id.astype(np.int64)) > 0))
+    assert bool(np.all(model.points.point3d_id[1:] > model.points.point3d_id[:-1]))
+    assert observations.offsets[0] == 0
+    assert observations.offsets[-1] == len(observations) == len(observations.xy_px)
+    assert len(observations.offsets) == len(images) + 1
+    assert bool(np.all((observations.point_idx >= -1) & (observations.point_idx < max(len(model.points), 1))))
+    assert bool(np.all((images.camera_idx >= -1) & (images.camera_idx < max(len(model.cameras), 1))))
+    for row in range(len(images)):
+        assert len(images.name[row].encode()) >= 0
+        camera = model.image(row).camera
+        assert camera is None or len(camera.params) == camera.model.num_params
+    for finding in model.findings:
+        assert finding.count > 0
+
+
+def assert_refused_or_a_model(folder: Path, changed: str) -> None:
+    """A change may also make another file the odd one out: one that lacks what the changed one now refers to."""
+    message = None
+    try:
+        model = open_model(folder)
+    except LoadError as error:
+        message = str(error)
+    if message is None:
+        assert_is_a_model(model)
+    else:
+        assert "\n" not in message
+        assert changed in message or "as its own comment says" in message
+
+
+def damage(data: st.DataObject, content: bytes) -> bytes:
+    changed = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(changed) - 1))
+        changed[at] = data.draw(st.integers(0, 255) | st.sampled_from(b" \n\0\xff\x7f-.#,"))
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(("write", "files"), [(write_binary, BINARY), (write_text, TEXT)])
+@DAMAGE
+@given(data=st.data())
+def test_changed_bytes_give_an_error_or_a_model(tmp_path: Path, write, files, data: st.DataObject):
+    write(tmp_path, rig_model())
+    name = data.draw(st.sampled_from(sorted(files)))
+    (tmp_path / name).write_bytes(damage(data, files[name]))
+    assert_refused_or_a_model(tmp_path, name)
+
+
+@pytest.mark.parametrize(("write", "files"), [(write_binary, BINARY), (write_text, TEXT)])
+@DAMAGE
+@given(data=st.data())
+def test_any_bytes_give_an_error_or_a_model(tmp_path: Path, write, files, data: st.DataObject):
+    write(tmp_path, rig_model())
+    name = data.draw(st.sampled_from(sorted(files)))
+    (tmp_path / name).write_bytes(data.draw(st.binary(max_size=200)))
+    assert_refused_or_a_model(tmp_path, name)

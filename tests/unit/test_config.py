@@ -1,0 +1,62 @@
+import pytest
+from pydantic import ValidationError
+
+from audit.cli.errors import ExitCode, KnownError
+from audit.cli.settings import read_config
+from audit.config import AuditConfig
+
+
+def write(tmp_path, text):
+    file = tmp_path / "audit.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_every_setting_is_documented_and_has_a_default():
+    assert AuditConfig() == AuditConfig.model_validate(AuditConfig().model_dump())
+    for name, field in AuditConfig.model_fields.items():
+        assert field.description, name
+
+
+def test_a_config_does_not_change():
+    with pytest.raises(ValidationError, match="frozen"):
+        AuditConfig().alpha = 0.1
+
+
+def test_defaults_then_file_then_command_line(tmp_path):
+    file = write(tmp_path, 'noise = "constant"\nalpha = 0.01\npose_offset_threshold_px = 1\n')
+    assert read_config(None, {"noise": None}) == AuditConfig()
+    from_file = read_config(file, {"noise": None, "policy": None})
+    assert (from_file.noise, from_file.alpha, from_file.pose_offset_threshold_px) == ("constant", 0.01, 1.0)
+    assert read_config(file, {"noise": "track"}) == from_file.model_copy(update={"noise": "track"})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("alhpa = 0.1", "unknown setting alhpa; expected one of noise, policy, alpha"),
+        ('alpha = "small"', "alpha: expected a valid number, found 'small'"),
+        ("alpha = 1.5", "alpha: expected less than 1, found 1.5"),
+        ("min_observations = 20.5", "min_observations: expected a valid integer, found 20.5"),
+        ("min_observations = true", "min_observations: expected a valid integer, found True"),
+        ('noise = "loud"', "noise: expected 'track' or 'constant', found 'loud'"),
+        ("[audit]\nalpha = 0.1", "unknown setting audit"),
+        ("alpha = ", "not a TOML file"),
+    ],
+)
+def test_a_wrong_file_is_one_line_that_names_file_and_key(tmp_path, text, words):
+    file = write(tmp_path, text)
+    with pytest.raises(KnownError) as caught:
+        read_config(file, {})
+    assert caught.value.exit_code == ExitCode.USAGE
+    assert str(caught.value).startswith(f"{file}: ")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_one_that_is_no_text_are_said_so(tmp_path):
+    with pytest.raises(KnownError, match="cannot be read"):
+        read_config(tmp_path / "none.toml", {})
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(KnownError, match="not a TOML file"):
+        read_config(tmp_path / "binary.toml", {})

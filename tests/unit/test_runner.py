@@ -1,0 +1,144 @@
+from pathlib import Path
+
+import audit_stubs
+import pytest
+import threadpoolctl
+from run_samples import write_models
+
+from audit.config import AuditConfig
+from audit.runner import Failure, audit_many, audit_one
+from loaders import discover
+from loaders.input_state import InputState, input_stamp, read_input_state
+
+
+class Memory:
+    """A sink that keeps everything in a dict."""
+
+    def __init__(self) -> None:
+        self.states: dict[str, InputState] = {}
+        self.tables = {}
+        self.dropped = []
+
+    def finished(self, ref):
+        return self.states.get(ref.key)
+
+    def write(self, ref, state, tables, seconds):
+        assert seconds > 0
+        self.states[ref.key] = state
+        self.tables[ref.key] = tables
+
+    def drop(self, key):
+        self.dropped.append(key)
+
+
+@pytest.fixture
+def refs(tmp_path):
+    write_models(tmp_path / "data", ["a", "broken", "deadly", "z"])
+    return discover([tmp_path / "data"]).refs
+
+
+def run(refs, sink, jobs=1, audit=audit_one):
+    done = []
+    failures = audit_many(refs, AuditConfig(), jobs=jobs, sink=sink, on_done=done.append, audit=audit)
+    assert sorted(ref.key for ref in done) == sorted(ref.key for ref in refs)
+    return failures
+
+
+def test_processes_give_the_tables_of_one_process(refs):
+    one, two = Memory(), Memory()
+    assert run(refs, one) == []
+    assert run(refs, two, jobs=2) == []
+    assert one.tables.keys() == two.tables.keys() == {ref.key for ref in refs}
+    for key, tables in one.tables.items():
+        assert all(tables[name].equals(two.tables[key][name]) for name in ("images", "models"))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_models_that_cannot_be_read_are_failures_in_the_order_given(refs, jobs):
+    for ref in (refs[3], refs[1]):
+        Path(ref.location, "images.bin").write_bytes(b"short")
+    sink = Memory()
+    failures = run(refs, sink, jobs)
+    assert [failure.location for failure in failures] == [refs[1].model_path, refs[3].model_path]
+    assert all("images.bin" in failure.message and "\n" not in failure.message for failure in failures)
+    assert sorted(sink.dropped) == sorted([refs[1].key, refs[3].key])
+    assert len(sink.tables) == 2
+
+
+def test_failures_are_told_in_the_order_given_whatever_finishes_first(refs, monkeypatch):
+    for ref in refs[:3]:
+        Path(ref.location, "images.bin").write_bytes(b"short")
+    backwards = lambda tasks, audit: ((task, audit(task)) for task in reversed(tasks))  # noqa: E731
+    monkeypatch.setattr("audit.runner._in_this_process", backwards)
+    assert [failure.location for failure in run(refs, Memory())] == [ref.model_path for ref in refs[:3]]
+
+
+def test_a_model_whose_process_dies_twice_is_a_failure_and_the_others_are_not(refs):
+    sink = Memory()
+    (failure,) = run(refs, sink, jobs=2, audit=audit_stubs.die)
+    assert isinstance(failure, Failure)
+    assert failure.location.endswith("deadly/sparse/0")
+    assert "died twice" in failure.message
+    assert len(sink.tables) == 3
+
+
+def test_a_model_whose_process_dies_once_is_tried_again(refs):
+    sink = Memory()
+    assert run(refs, sink, jobs=2, audit=audit_stubs.die_once) == []
+    assert len(sink.tables) == 4
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_nobody_expects_is_raised(refs, jobs):
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        audit_many(refs, AuditConfig(), jobs=jobs, sink=Memory(), audit=audit_stubs.break_down)
+
+
+def test_a_bug_says_which_model_it_met(refs, monkeypatch):
+    def broken(*_: object):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("audit.runner.audit_model", broken)
+    with pytest.raises(ZeroDivisionError) as caught:
+        run(refs, Memory())
+    assert caught.value.__notes__ == [f"while auditing {refs[0].model_path}"]
+
+
+def test_touched_files_are_compared_by_content(refs):
+    sink = Memory()
+    run(refs, sink)
+    before = dict(sink.tables)
+    file = Path(refs[0].location, "images.bin")
+    file.touch()
+    assert input_stamp(refs[0].location) != sink.states[refs[0].key].stamp
+    run(refs, sink)
+    assert all(sink.tables[key] is tables for key, tables in before.items())
+    content = bytearray(file.read_bytes())
+    content[20] ^= 1
+    file.write_bytes(content)
+    run(refs, sink)
+    assert sink.tables[refs[0].key] is not before[refs[0].key]
+    assert sink.tables[refs[1].key] is before[refs[1].key]
+
+
+def test_blas_has_one_thread_while_models_are_audited(refs):
+    seen = []
+
+    def look(task):
+        seen.extend(pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas")
+        return audit_one(task)
+
+    run(refs, Memory(), audit=look)
+    assert seen
+    assert set(seen) == {1}
+
+
+def test_the_state_of_a_model_covers_all_its_files(tmp_path):
+    write_models(tmp_path, ["a"])
+    folder = tmp_path / "a" / "sparse" / "0"
+    states = [read_input_state(str(folder))]
+    assert states[0].num_bytes == sum(path.stat().st_size for path in folder.iterdir())
+    for name in ("rigs.bin", "points3D.bin", "cameras.txt"):
+        (folder / name).write_bytes(b"changed")
+        states.append(read_input_state(str(folder)))
+    assert len({state.digest for state in states}) == len({state.stamp for state in states}) == 4
