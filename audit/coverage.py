@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
@@ -25,11 +27,12 @@ def _outside_octagon(xy_px: FloatArray) -> FloatArray:
     """Drop points strictly inside the octagon of the extreme points in eight directions: they are not on the hull."""
     x, y = xy_px[:, 0], xy_px[:, 1]
     directions = (y, x + y, x, x - y)
-    corners = [int(np.argmin(d)) for d in directions] + [int(np.argmax(d)) for d in directions]
-    polygon = _counter_clockwise(np.unique(xy_px[corners], axis=0))
+    corners = {int(np.argmin(d)) for d in directions} | {int(np.argmax(d)) for d in directions}
+    polygon = _counter_clockwise(xy_px[sorted(corners)])
     inside = np.ones(len(xy_px), dtype=bool)
-    for start, end in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        inside &= (end[0] - start[0]) * (y - start[1]) - (end[1] - start[1]) * (x - start[0]) > 0
+    for (start_x, start_y), (end_x, end_y) in pairwise([*polygon.tolist(), polygon[0].tolist()]):
+        along_x, along_y = end_x - start_x, end_y - start_y
+        inside &= along_x * y - along_y * x > along_x * start_y - along_y * start_x
     return xy_px[~inside]
 
 
@@ -48,7 +51,7 @@ def occupied_cells(xy_px: FloatArray, width: int, height: int, grid: int) -> int
     """Number of cells with at least one inlier, of a grid x grid division of the image; outside points are in none."""
     if width * height == 0 or not len(xy_px):
         return 0
-    cell = np.floor(xy_px * (grid / np.array([width, height], dtype=np.float64)))
-    inside = ((cell >= 0) & (cell < grid)).all(axis=1)
-    index = (cell[inside, 0] * grid + cell[inside, 1]).astype(np.int64)
+    column, row = np.floor(xy_px[:, 0] * (grid / width)), np.floor(xy_px[:, 1] * (grid / height))
+    inside = (column >= 0) & (column < grid) & (row >= 0) & (row < grid)
+    index = (column * grid + row)[inside].astype(np.int64)
     return int(np.count_nonzero(np.bincount(index, minlength=grid * grid)))

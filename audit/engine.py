@@ -74,8 +74,8 @@ class ModelAuditor:
         point_idx = observations.point_idx[row]
         return InlierSet(
             self.model.image(image_idx),
-            observations.xy_px[row],
-            self.model.points.xyz_world[point_idx],
+            observations.xy_px.take(row, axis=0),
+            self.model.points.xyz_world.take(point_idx, axis=0),
             point_idx,
             num_dangling=int(residuals.num_dangling[image_idx]),
             num_behind=int(residuals.num_behind[image_idx]),

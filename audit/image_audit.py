@@ -64,10 +64,18 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
     With points that were triangulated from this very image the residuals are shrunk (METHOD.md section 3a).
     """
     part = image_residuals(inliers.image, inliers.xy_px, inliers.xyz_world, inliers.point_idx)
-    constant = constant_noise(part.residuals_px)
-    return judged(
-        part.inliers, part.residuals_px, part.pose_offset_px, constant, constant, None, config or AuditConfig()
+    rows = part.inlier_row
+    kept = InlierSet(
+        inliers.image,
+        inliers.xy_px[rows],
+        inliers.xyz_world[rows],
+        inliers.point_idx[rows],
+        num_dangling=inliers.num_dangling + part.num_dangling,
+        num_behind=inliers.num_behind + part.num_behind,
+        num_nonfinite=inliers.num_nonfinite + part.num_nonfinite,
     )
+    constant = constant_noise(part.residuals_px)
+    return judged(kept, part.residuals_px, part.pose_offset_px, constant, constant, None, config or AuditConfig())
 
 
 def judged(

@@ -20,8 +20,8 @@ def consistency(cutoff: float) -> float:
 
 
 CONSISTENCY = consistency(CUTOFF)  # kappa = 0.92053...
-_NORMAL_MEDIAN_SQ = 0.4549364  # median of chi^2(1)
 _RELATIVE_CHANGE = 1e-8
+_NEWTON_CHANGE = 1e-4  # of a Newton step: what is left after it is of the order of its square
 _MAX_ITERATIONS = 100
 
 
@@ -53,17 +53,13 @@ def fit_constant_variance(sq_residuals_px2: FloatArray) -> VarianceFit:
     n = y.size
     if n == 0 or not np.isfinite(total := float(y.sum())) or total == 0.0:
         return UNDETERMINED
-    theta = float(np.median(y)) / _NORMAL_MEDIAN_SQ
-    if theta <= 0.0 or np.count_nonzero(y >= CUTOFF**2 * theta) * CUTOFF**2 >= 0.5 * n * CONSISTENCY:
-        theta = total / (n * CONSISTENCY)  # below the root in u, where Newton cannot overshoot
+    theta = total / (n * CONSISTENCY)  # below the root in u
     for _ in range(_MAX_ITERATIONS):
         inside = y < CUTOFF**2 * theta
         num_clipped = n - int(np.count_nonzero(inside))
-        unclipped_sum = float(np.dot(y, inside))
+        unclipped_sum = float(y.sum(where=inside)) if num_clipped else total
         denominator = n * CONSISTENCY - num_clipped * CUTOFF**2
-        if (
-            denominator <= 0.0 or unclipped_sum == 0.0
-        ):  # more than kappa / c^2 of y are positive outliers of a zero bulk
+        if denominator <= 0.0 or unclipped_sum == 0.0:  # positive outliers of a bulk that is zero: no root
             return UNDETERMINED
         previous, theta = theta, unclipped_sum / denominator
         if abs(theta - previous) <= 1e-14 * theta:
@@ -76,8 +72,8 @@ def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> Var
 
     Parameters
     ----------
-    sq_residuals_px2 : (m,) y, squared residuals of single axes, px^2
-    predictor_px2 : (m,) a^2 of the same axis, px^2, finite and >= 0
+    sq_residuals_px2 : (k, m) or (m,) y, squared residuals of single axes, px^2; rows share their predictors
+    predictor_px2 : (m,) a^2, px^2, finite and >= 0
 
     Notes
     -----
@@ -87,23 +83,25 @@ def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> Var
     that of a constant), then Newton with scoring steps where Newton leaves the region. Where the paper says IRLS
     without naming weights, this is our choice; METHOD.md says why.
     """
-    constant = fit_constant_variance(sq_residuals_px2)
+    y = np.atleast_2d(sq_residuals_px2)
+    constant = fit_constant_variance(y)
     if not constant.converged or not predictor_px2.any():
         return constant
     theta = np.array([constant.detector_px2, 0.0])
-    equation, _ = _estimating_equation(sq_residuals_px2, predictor_px2, theta)
+    equation, _ = _estimating_equation(y, predictor_px2, theta)
     if equation[1] <= 0.0:
         return constant
     if predictor_px2.min() > 0.0:
-        proportional = fit_constant_variance(sq_residuals_px2 / predictor_px2)
+        proportional = fit_constant_variance(y / predictor_px2)
         edge = np.array([0.0, proportional.detector_px2])
-        if proportional.converged and _estimating_equation(sq_residuals_px2, predictor_px2, edge)[0][0] <= 0.0:
+        if proportional.converged and _estimating_equation(y, predictor_px2, edge)[0][0] <= 0.0:
             return VarianceFit(0.0, proportional.detector_px2, converged=True)
     previous = theta
     for _ in range(_MAX_ITERATIONS):
-        previous, theta = theta, _next_theta(sq_residuals_px2, predictor_px2, theta)
+        previous, (theta, is_newton) = theta, _next_theta(y, predictor_px2, theta)
         scale, old = _variance(predictor_px2, theta), _variance(predictor_px2, previous)
-        if np.all(np.abs(scale - old) <= _RELATIVE_CHANGE * old):
+        tolerance = _NEWTON_CHANGE if is_newton else _RELATIVE_CHANGE
+        if np.all(np.abs(scale - old) <= tolerance * old):
             return VarianceFit(float(theta[0]), float(theta[1]), converged=True)
     theta = 0.5 * (theta + previous)
     return VarianceFit(float(theta[0]), float(theta[1]), converged=False)
@@ -114,39 +112,47 @@ def _variance(predictor: FloatArray, theta: FloatArray) -> FloatArray:
 
 
 def _estimating_equation(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Left side (2,) of the estimating equation and its derivative (2, 2) in theta."""
-    s = _variance(predictor, theta)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = y / s
-    ratio = np.where(s > 0, ratio, np.where(y > 0, np.inf, 1.0))
-    s = np.maximum(s, np.finfo(np.float64).tiny)
-    inside = ratio < CUTOFF**2
-    excess = np.minimum(ratio, CUTOFF**2) / CONSISTENCY - 1.0
-    first = excess / s
-    slope = -(first + np.where(inside, ratio, 0.0) / (CONSISTENCY * s)) / s
-    cross = float(slope @ predictor)
-    derivative = np.array([[slope.sum(), cross], [cross, slope @ (predictor * predictor)]])
+    """Left side (2,) of the estimating equation and its derivative (2, 2) in theta; y is (k, m), predictor (m,)."""
+    s = np.maximum(_variance(predictor, theta), np.finfo(np.float64).tiny)
+    inverse = 1.0 / s
+    clipped, unclipped = np.zeros_like(s), np.zeros_like(s)
+    for row in y:
+        ratio = np.minimum(row * inverse, CUTOFF**2)
+        clipped += ratio
+        unclipped += ratio * (ratio < CUTOFF**2)
+    first = (clipped / CONSISTENCY - len(y)) * inverse
+    slope = -(first + unclipped * inverse / CONSISTENCY) * inverse
+    weighted = slope * predictor
+    cross = float(weighted.sum())
+    derivative = np.array([[slope.sum(), cross], [cross, weighted @ predictor]])
     return np.array([first.sum(), first @ predictor]), derivative
 
 
-def _next_theta(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:
-    """One Newton step if it stays inside theta > 0, else one Fisher scoring step with non-negative least squares."""
-    equation, derivative = _estimating_equation(y, predictor, theta)
-    determinant = derivative[0, 0] * derivative[1, 1] - derivative[0, 1] ** 2
-    if determinant > 0 and derivative[0, 0] < 0:  # Newton only near the root; from theta_2 = 0 never
-        newton = theta - np.linalg.solve(derivative, equation)
-        if np.all(newton > 0.1 * theta) and np.all(newton < 10.0 * theta):
-            return np.asarray(newton)
-    return scoring_step(y, predictor, theta)
+def _next_theta(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, bool]:
+    """One Newton step (True) if it stays near theta > 0, else one Fisher scoring step (False)."""
+    if theta.min() > 0:
+        equation, derivative = _estimating_equation(y, predictor, theta)
+        determinant = derivative[0, 0] * derivative[1, 1] - derivative[0, 1] ** 2
+        if determinant > 0 and derivative[0, 0] < 0:
+            right = derivative[1, 1] * equation[0] - derivative[0, 1] * equation[1]
+            left = derivative[0, 0] * equation[1] - derivative[0, 1] * equation[0]
+            newton = theta - np.array([right, left]) / determinant
+            if np.all(newton > 0.1 * theta) and np.all(newton < 10.0 * theta):
+                return newton, True
+    return scoring_step(y, predictor, theta), False
 
 
 def scoring_step(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:
-    """One step of METHOD.md section 2 as it is written: winsorised pseudo-responses, rows weighted 1 / s, NNLS."""
+    """One step of METHOD.md section 2 as it is written: winsorised pseudo-responses, rows weighted 1 / s, NNLS.
+
+    y is (k, m) or (m,), predictor (m,).
+    """
+    y = np.atleast_2d(y)
     s = _variance(predictor, theta)
     positive = s > 0
-    s, y, a = s[positive], y[positive], predictor[positive]
-    weight = 1.0 / (s * s)
-    response = np.minimum(y / s, CUTOFF**2) / CONSISTENCY * s
+    s, y, a = s[positive], y[:, positive], predictor[positive]
+    weight = len(y) / (s * s)
+    response = np.minimum(y / s, CUTOFF**2).sum(axis=0) / len(y) / CONSISTENCY * s
     gram = np.array([[weight.sum(), weight @ a], [weight @ a, weight @ (a * a)]])
     right = np.array([weight @ response, (weight * a) @ response])
     free = np.linalg.solve(gram, right) if np.linalg.det(gram) > 0 else np.array([-1.0, -1.0])

@@ -9,23 +9,30 @@ import numpy as np
 from audit.cameras import project_with_jacobians
 from audit.stationarity import pose_offset_px
 from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import ImageRecord, InlierSet, SparseModel
+from loaders.model import CameraRecord, ImageRecord, SparseModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageResiduals:
-    """The inliers of one image, projected.
+    """The inliers among the linked points of one image, projected.
 
-    inliers: the 2D-3D inliers.                   inlier_row: (n,) their rows among the observations given.
-    residuals_px: (2, n) observed - projected.    point_jacobian: (2, 3, n) d projection / d point in the world, px
-    per model unit.                               pose_offset_px: METHOD.md section 6, NaN without inliers.
+    inlier_row: (n,) their rows among the points given.          residuals_px: (2, n) observed - projected.
+    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (3, n).
+    num_dangling, num_behind, num_nonfinite: points that are no inliers, by cause.
     """
 
-    inliers: InlierSet
     inlier_row: IntArray
     residuals_px: FloatArray
-    point_jacobian: FloatArray
-    pose_offset_px: float
+    jacobian_cam: FloatArray
+    xyz_cam: FloatArray
+    num_dangling: int
+    num_behind: int
+    num_nonfinite: int
+
+    @property
+    def pose_offset_px(self) -> float:
+        """RMS residual that moving the pose alone would remove (METHOD.md section 6), NaN without inliers."""
+        return pose_offset_px(self.residuals_px, self.jacobian_cam, self.xyz_cam)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,70 +77,55 @@ def image_residuals(
     projection is finite. Observations that are themselves not finite count as not finite.
     """
     linked = point_idx >= 0
-    num_dangling = int(linked.size - np.count_nonzero(linked))
+    num_dangling = linked.size - int(np.count_nonzero(linked))
     camera = image.camera
     with np.errstate(all="ignore"):
         xyz_cam = image.cam_from_world(xyz_world)
-        finite = np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1)
+        usable = camera is not None and bool(np.isfinite(camera.params).all())
+        finite = linked & np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1) & usable
         spherical = camera is not None and camera.model.is_spherical
-        in_front = (xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0
-        candidate = np.flatnonzero(linked & finite & in_front)
-        num_behind = int(np.count_nonzero(linked & finite & ~in_front))
-        if camera is None or not np.isfinite(camera.params).all():
-            candidate, num_behind = candidate[:0], 0
-            xy_projected, jacobian_cam = np.empty((0, 2)), np.empty((0, 2, 3))
-        else:
-            projection = project_with_jacobians(camera.model, camera.params, xyz_cam[candidate], with_params=False)
-            xy_projected, jacobian_cam = projection.xy_px, projection.d_xy_d_cam
-        valid = np.isfinite(xy_projected).all(axis=1)
+        candidate = finite & ((xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0)
+        num_behind = int(np.count_nonzero(finite)) - int(np.count_nonzero(candidate))
+        residuals, jacobian = np.empty((2, 0)), np.empty((2, 3, 0))
+        rows = np.flatnonzero(candidate)
+        if camera is not None and rows.size:
+            all_in = rows.size == linked.size
+            xyz_cam = xyz_cam if all_in else xyz_cam[rows]
+            residuals, jacobian = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
+        valid = np.isfinite(residuals).all(axis=0)
     if not valid.all():
-        candidate, xy_projected, jacobian_cam = candidate[valid], xy_projected[valid], jacobian_cam[valid]
-    rows = candidate
-    residuals = xy_px[rows] - xy_projected
-    if camera is not None and camera.model.is_spherical:
-        residuals[:, 0] -= camera.width * np.round(residuals[:, 0] / camera.width)  # the seam is no edge
-    jacobian_world = jacobian_cam.reshape(-1, 3) @ image.rotation_cam_from_world
-    inliers = InlierSet(
-        image,
-        xy_px[rows],
-        xyz_world[rows],
-        point_idx[rows],
-        num_dangling=num_dangling,
-        num_behind=num_behind,
-        num_nonfinite=int(linked.size) - num_dangling - num_behind - len(rows),
-    )
+        rows, xyz_cam = rows[valid], xyz_cam[valid]
+        residuals, jacobian = residuals[:, valid], jacobian[:, :, valid]
+    num_nonfinite = linked.size - num_dangling - num_behind - rows.size
     return ImageResiduals(
-        inliers,
-        rows,
-        residuals.T.copy(),
-        np.ascontiguousarray(jacobian_world.reshape(-1, 2, 3).transpose(1, 2, 0)),
-        pose_offset_px(residuals, jacobian_cam, xyz_cam[rows]),
+        rows, residuals, jacobian, xyz_cam.T if rows.size else np.empty((3, 0)), num_dangling, num_behind, num_nonfinite
     )
+
+
+def _residuals(camera: CameraRecord, xy_px: FloatArray, xyz_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Observed minus projected (2, n) and the Jacobian (2, 3, n) in the camera frame."""
+    projection = project_with_jacobians(camera.model, camera.params, xyz_cam, with_params=False)
+    residuals = np.subtract(xy_px.T, projection.xy_px.T, order="C")
+    if camera.model.is_spherical:
+        residuals[0] -= camera.width * np.round(residuals[0] / camera.width)  # the seam is no edge
+    return residuals, np.ascontiguousarray(projection.d_xy_d_cam.transpose(1, 2, 0))
 
 
 def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:
     """(m, 3) world points; NaN where dangling."""
     if not len(model.points):
         return np.full((len(point_idx), 3), np.nan)
-    xyz = model.points.xyz_world[point_idx]
+    xyz = model.points.xyz_world.take(point_idx, axis=0, mode="wrap")
     dangling: BoolArray = point_idx < 0
     if dangling.any():
         xyz[dangling] = np.nan
     return xyz
 
 
-def inliers_of(model: SparseModel, image_idx: int) -> ImageResiduals:
-    """Return the inliers of the image in row ``image_idx`` with their residuals."""
-    first, last = model.observations.offsets[image_idx : image_idx + 2]
-    point_idx = model.observations.point_idx[first:last]
-    return image_residuals(
-        model.image(image_idx), model.observations.xy_px[first:last], _points_of(model, point_idx), point_idx
-    )
-
-
 def model_residuals(model: SparseModel) -> ModelResiduals:
     """Return the inliers of all images with their residuals; one pass over the images, arrays throughout."""
-    num_images, capacity = len(model.images), len(model.observations)
+    observations = model.observations
+    num_images, capacity = len(model.images), len(observations)
     offsets = np.zeros(num_images + 1, dtype=np.int64)
     observation_row = np.empty(capacity, dtype=np.int64)
     residuals = np.empty((2, capacity))
@@ -141,20 +133,22 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     pose_offset = np.full(num_images, np.nan)
     counts = np.zeros((3, num_images), dtype=np.int64)
     for image_idx in range(num_images):
-        part = inliers_of(model, image_idx)
-        first = offsets[image_idx]
-        last = offsets[image_idx + 1] = first + part.inlier_row.size
-        observation_row[first:last] = part.inlier_row + model.observations.offsets[image_idx]
-        residuals[:, first:last] = part.residuals_px
-        jacobian[:, :, first:last] = part.point_jacobian
+        image, linked = model.image(image_idx), slice(*observations.offsets[image_idx : image_idx + 2])
+        point_idx = observations.point_idx[linked]
+        part = image_residuals(image, observations.xy_px[linked], _points_of(model, point_idx), point_idx)
+        own = slice(offsets[image_idx], offsets[image_idx] + part.inlier_row.size)
+        offsets[image_idx + 1] = own.stop
+        np.add(part.inlier_row, linked.start, out=observation_row[own])
+        residuals[:, own] = part.residuals_px
+        jacobian[:, :, own] = image.rotation_cam_from_world.T @ part.jacobian_cam
         pose_offset[image_idx] = part.pose_offset_px
-        counts[:, image_idx] = part.inliers.num_dangling, part.inliers.num_behind, part.inliers.num_nonfinite
+        counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite
     total = offsets[-1]
     observation_row = observation_row[:total]
     return ModelResiduals(
         offsets,
         observation_row,
-        model.observations.point_idx[observation_row],
+        observations.point_idx if total == capacity else observations.point_idx[observation_row],
         residuals[:, :total],
         jacobian[:, :, :total],
         pose_offset,

@@ -11,26 +11,31 @@ from loaders.arrays import FloatArray
 _SMALLEST_PIVOT = 1e-10  # of the Gram matrix of unit columns; below it the orthonormal basis is taken by SVD
 
 
-def pose_jacobian(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
-    """Return (n, 2, 6): d projection / d (rotation, translation), left perturbation in the camera frame.
+def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return (6, 2, n): d projection / d (rotation, translation), left perturbation in the camera frame.
 
     Parameters
     ----------
-    jacobian_cam : (n, 2, 3) d projection / d point in the camera frame, px per model unit
-    xyz_cam : (n, 3) points in the camera frame, model units
+    jacobian_cam : (2, 3, n) d projection / d point in the camera frame, px per model unit
+    xyz_cam : (3, n) points in the camera frame, model units
 
     Notes
     -----
     A rotation by the small vector w (rad) about the camera centre moves a point by w x Xc, a translation t by t.
     """
-    x, y, z = (xyz_cam[:, i, None] for i in range(3))
-    jx, jy, jz = (jacobian_cam[:, :, i] for i in range(3))
-    out = np.empty((len(xyz_cam), 2, 6))
-    out[:, :, 0] = jz * y - jy * z
-    out[:, :, 1] = jx * z - jz * x
-    out[:, :, 2] = jy * x - jx * y
-    out[:, :, 3:] = jacobian_cam
+    x, y, z = xyz_cam
+    jx, jy, jz = jacobian_cam.transpose(1, 0, 2)
+    out = np.empty((6, *jx.shape))
+    out[0] = jz * y - jy * z
+    out[1] = jx * z - jz * x
+    out[2] = jy * x - jx * y
+    out[3:] = jacobian_cam.transpose(1, 0, 2)
     return out
+
+
+def pose_jacobian(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return (n, 2, 6): `pose_columns` with points first, of (n, 2, 3) and (n, 3)."""
+    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam.T).transpose(2, 1, 0)
 
 
 def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: FloatArray) -> float:
@@ -38,31 +43,32 @@ def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: 
 
     Parameters
     ----------
-    residuals_px : (n, 2) observed - projected        jacobian_cam, xyz_cam : as in `pose_jacobian`
+    residuals_px : (2, n) observed - projected        jacobian_cam, xyz_cam : as in `pose_columns`
 
     Returns
     -------
     float
         px; NaN without observations. A bundle-adjusted image has ~0, a pose changed afterwards 1..3.
     """
-    n = len(residuals_px)
+    n = residuals_px.shape[1]
     if n == 0:
         return math.nan
-    columns = pose_jacobian(jacobian_cam, xyz_cam).reshape(2 * n, 6)
-    norms = np.sqrt(np.einsum("ij,ij->j", columns, columns))
-    if not np.isfinite(norms).all():  # at the poles of a panorama: such a point does not move the pose
-        columns = np.where(np.isfinite(columns).all(axis=1, keepdims=True), columns, 0.0)
-        norms = np.sqrt(np.einsum("ij,ij->j", columns, columns))
-    columns = columns[:, norms > 0] / norms[norms > 0]
+    columns = pose_columns(jacobian_cam, xyz_cam).reshape(6, 2 * n)
+    gram = columns @ columns.T
+    if not np.isfinite(gram).all():  # at the poles of a panorama: such a point does not move the pose
+        columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
+        gram = columns @ columns.T
+    used = gram.diagonal() > 0
+    norms = np.sqrt(gram.diagonal()[used])
     y = residuals_px.reshape(2 * n)
-    gram = columns.T @ columns
+    right = (columns @ y)[used] / norms
     try:
-        factor = np.linalg.cholesky(gram)
+        factor = np.linalg.cholesky(gram[np.ix_(used, used)] / norms / norms[:, None])
     except np.linalg.LinAlgError:
         factor = np.zeros((1, 1))
     if factor.diagonal().min() ** 2 > _SMALLEST_PIVOT:
-        projected = np.linalg.solve(factor, columns.T @ y)
+        projected = np.linalg.solve(factor, right)
     else:
-        basis, singular, _ = np.linalg.svd(columns, full_matrices=False)
+        basis, singular, _ = np.linalg.svd(columns[used].T / norms, full_matrices=False)
         projected = basis[:, singular > 1e-9 * singular[0]].T @ y
     return float(np.sqrt(projected @ projected / n))

@@ -13,7 +13,7 @@ from loaders.arrays import BoolArray, FloatArray, IntArray
 
 _SUFFICIENT_DETERMINANT = 1e-6  # of the information matrix with unit diagonal: closed-form inverse, else eigenvectors
 _RANK_THRESHOLD = 1e-10  # eigenvalues of that matrix, relative to the largest: singular values of J below 1e-5
-_CHUNK = 1 << 15  # observations per pass: the temporaries stay in the processor's cache
+_CHUNK = 1 << 14  # observations per pass: the temporaries stay in the processor's cache
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -67,57 +67,81 @@ def track_statistics(
     Cameras are treated as exact: their share of the leverage is 8 / 2n of an image, and is left in.
     """
     n = residuals_px.shape[1]
-    differentiable = np.isfinite(point_jacobian).all(axis=(0, 1))
+    differentiable = _finite_columns(point_jacobian)
     if not differentiable.all():
         point_jacobian = np.where(differentiable, point_jacobian, 0.0)
     length = np.bincount(point_idx, minlength=num_points)
     inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
-    gradient = np.zeros((3, num_points))
-    for axis in range(3):
-        gradient[axis] = sum_by_point(
-            point_jacobian[0, axis] * residuals_px[0] + point_jacobian[1, axis] * residuals_px[1], point_idx, num_points
-        )
-    step = symmetric_times(inverse, gradient)  # A^+ J^T eps: where the points would move
-    projected = np.empty_like(residuals_px)
-    removable = 0.0
-    complement = np.empty((3, n))  # xx, xy, yy of I - H
+    projected, complement, removable = _project_off_points(residuals_px, point_jacobian, point_idx, inverse)
+    square = np.empty(n)
     for part in _chunks(n):
-        idx = point_idx[part]
-        jacobian = point_jacobian[:, :, part]
-        move = step[:, idx]
-        for row in range(2):
-            removed = _dot(jacobian[row], move)
-            removable += float(removed @ removed)
-            projected[row, part] = residuals_px[row, part] - removed
-        local = inverse[:, idx]
-        by_x, by_y = symmetric_times(local, jacobian[0]), symmetric_times(local, jacobian[1])
-        complement[0, part] = 1.0 - _dot(jacobian[0], by_x)
-        complement[1, part] = -_dot(jacobian[1], by_x)
-        complement[2, part] = 1.0 - _dot(jacobian[1], by_y)
-    square = projected[0] ** 2 + projected[1] ** 2
+        np.multiply(projected[0, part], projected[0, part], out=square[part])
+        square[part] += projected[1, part] * projected[1, part]
     track_sq = sum_by_point(square, point_idx, num_points)
 
-    whitened = np.empty_like(residuals_px)
-    verified = np.empty(n, dtype=bool)
-    other_sq = np.empty(n)
+    whitened, verified, other_sq = projected, np.empty(n, dtype=bool), square  # what is read is not needed again
+    track_length = length.take(point_idx)
     for part in _chunks(n):
-        idx = point_idx[part]
-        smallest, whitened[0, part], whitened[1, part] = _inverse_root_times(complement[:, part], projected[:, part])
-        verified[part] = (length[idx] >= min_track_length) & (smallest >= min_eigenvalue) & differentiable[part]
-        sq = whitened[0, part] ** 2 + whitened[1, part] ** 2
-        other_sq[part] = np.maximum(track_sq[idx] - sq, 0.0)  # (3)
-    whitened[:, ~verified] = np.nan
-    other_sq[~verified] = np.nan
-    track_length = length[point_idx]
+        smallest, x, y = _inverse_root_times(complement[:, part], projected[:, part])
+        good = (track_length[part] >= min_track_length) & (smallest >= min_eigenvalue) & differentiable[part]
+        verified[part] = good
+        other = np.maximum(track_sq.take(point_idx[part]) - (x * x + y * y), 0.0)  # (3)
+        whitened[0, part] = np.where(good, x, np.nan)
+        whitened[1, part] = np.where(good, y, np.nan)
+        other_sq[part] = np.where(good, other, np.nan)
     return TrackStatistics(
         whitened,
         verified,
         track_length,
         other_sq,
-        2 * track_length - 2 - rank[point_idx],
+        (2 * length - 2 - rank).take(point_idx),
         removable,
-        float(np.sum(residuals_px**2)),
+        sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(n)),
     )
+
+
+def _finite_columns(point_jacobian: FloatArray) -> BoolArray:
+    finite = np.empty(point_jacobian.shape[2], dtype=bool)
+    for part in _chunks(finite.size):
+        np.isfinite(point_jacobian[:, :, part]).all(axis=(0, 1), out=finite[part])
+    return finite
+
+
+def _project_off_points(
+    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IntArray, inverse: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Residuals (2, n) off their tracks' column spaces, I - H as (3, n) xx, xy, yy, and the sum of squares removed."""
+    n = point_idx.size
+    gradient = np.empty_like(inverse[:3])
+    product = np.empty(n)
+    for axis in range(3):
+        _sum_of_two_products(point_jacobian[:, axis], residuals_px, product)
+        gradient[axis] = sum_by_point(product, point_idx, inverse.shape[1])
+    step = symmetric_times(inverse, gradient)  # A^+ J^T eps: where the points would move
+    projected = np.empty_like(residuals_px)
+    complement = np.empty((3, n))
+    removable = 0.0
+    for part in _chunks(n):
+        idx = point_idx[part]
+        jacobian = point_jacobian[:, :, part]
+        move = step.take(idx, axis=1)
+        for row in range(2):
+            removed = _dot(jacobian[row], move)
+            removable += float(removed @ removed)
+            np.subtract(residuals_px[row, part], removed, out=projected[row, part])
+        local = inverse.take(idx, axis=1)
+        by_x, by_y = symmetric_times(local, jacobian[0]), symmetric_times(local, jacobian[1])
+        np.subtract(1.0, _dot(jacobian[0], by_x), out=complement[0, part])
+        np.negative(_dot(jacobian[1], by_x), out=complement[1, part])
+        np.subtract(1.0, _dot(jacobian[1], by_y), out=complement[2, part])
+    return projected, complement, removable
+
+
+def _sum_of_two_products(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Write a[0] b[0] + a[1] b[1] of (2, n) arrays into out (n,), a piece at a time."""
+    for part in _chunks(out.size):
+        np.multiply(a[0, part], b[0, part], out=out[part])
+        out[part] += a[1, part] * b[1, part]
 
 
 def _chunks(n: int) -> list[slice]:
@@ -153,8 +177,9 @@ def inverse_information(
 ) -> tuple[FloatArray, IntArray]:
     """Return the (pseudo-)inverse (6, P) of each track's information A = sum J^T J, and its rank (P,)."""
     information = np.empty((6, num_points))
+    product = np.empty(point_idx.size)
     for row, (i, j) in enumerate(_SYMMETRIC):
-        product = point_jacobian[0, i] * point_jacobian[0, j] + point_jacobian[1, i] * point_jacobian[1, j]
+        _sum_of_two_products(point_jacobian[:, i], point_jacobian[:, j], product)
         information[row] = sum_by_point(product, point_idx, num_points)
     scale = np.sqrt(information[[0, 3, 5]])
     scale[scale == 0] = 1.0
