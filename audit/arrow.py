@@ -7,23 +7,36 @@ built from buffers do not.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coded:
+    """A column of few different texts: ``names[codes[i]]`` in row i; ``codes`` are int32."""
+
+    codes: npt.NDArray[np.int32]
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+
 Values = npt.NDArray[Any] | Sequence[Any]
 
 
-def build_table(columns: Mapping[str, Values], wanted: pa.Schema) -> pa.Table:
+def build_table(columns: Mapping[str, Values | Coded], wanted: pa.Schema) -> pa.Table:
     """Build an Arrow table of a given schema.
 
     Parameters
     ----------
     columns : one entry per field of the schema, all of one length. Numbers and booleans: an array, a masked array or
-        a sequence that may hold None. Text: a sequence of str or None. Lists: a sequence of sequences or None;
-        elements of a list of structs are objects with the struct's fields as attributes.
+        a sequence that may hold None. Text: a sequence of str or None; dictionaries of text: `Coded`. Lists: a sequence
+        of sequences or None; elements of a list of structs are objects with the struct's fields as attributes.
     wanted : the schema, for instance ``audit.table.schema("images")``
 
     Returns
@@ -49,9 +62,9 @@ def build_table(columns: Mapping[str, Values], wanted: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=wanted)
 
 
-def _build_column(values: Values, field: pa.Field[Any]) -> pa.Array[Any]:
+def _build_column(values: Values | Coded, field: pa.Field[Any]) -> pa.Array[Any]:
     try:
-        return _build_array(values, field.type)
+        return _coded_array(values, field.type) if isinstance(values, Coded) else _build_array(values, field.type)
     except (TypeError, ValueError) as error:
         raise type(error)(f"column {field.name}: {error}") from error
 
@@ -67,7 +80,7 @@ def _build_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
 
 
 def _number_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
-    dtype = np.dtype(kind.to_pandas_dtype())
+    dtype = np.dtype(str(kind))
     array, valid = _split_missing(values, dtype)
     if len(array) and array.dtype.kind not in {"f": "fiu", "b": "b"}.get(dtype.kind, "iu"):
         raise TypeError(f"expected {kind}, found {array.dtype}")
@@ -100,6 +113,13 @@ def _text_array(values: Values) -> pa.Array[Any]:
     data = pa.py_buffer(b"".join(text for text in encoded if text is not None))
     valid = np.array([text is not None for text in encoded], dtype=bool)
     return pa.Array.from_buffers(pa.string(), len(encoded), [_validity(valid), offsets, data])
+
+
+def _coded_array(values: Coded, kind: pa.DataType) -> pa.Array[Any]:
+    if not isinstance(kind, pa.DictionaryType):
+        raise TypeError(f"expected {kind}, found codes and names")
+    buffers = [None, _buffer(values.codes.astype(np.int32, copy=False))]
+    return pa.DictionaryArray.from_buffers(kind, len(values), buffers, _text_array(values.names))
 
 
 def _list_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:

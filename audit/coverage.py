@@ -1,4 +1,4 @@
-"""How much of the image do the inliers see? (METHOD.md section 6)."""
+"""How much of the image do the inliers see? (method.md section 6)."""
 
 from __future__ import annotations
 

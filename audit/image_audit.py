@@ -6,8 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from audit.config import AuditConfig
+from audit.blame import Significance
+from audit.camera_audit import image_advice
+from audit.camera_facts import CameraFacts, CameraShape, camera_facts
+from audit.config import AuditConfig, PolicyName
+from audit.misfit import MisfitTests
+from audit.misfit_verdict import Misfit, find_misfit, judge_misfit
 from audit.normality import NormalityTests, normality_tests
+from audit.plausibility import PlausibilityLimits, judge_plausible, judge_pose
 from audit.residuals import image_residuals
 from audit.standardise import ImageNoise, constant_noise
 from audit.verdict import Judgement, Reason, ReasonCode, Verdict, combine, judge_ks
@@ -17,14 +23,48 @@ from loaders.model import ImageRecord, InlierSet
 _EXACT_SHARE = 1e-9  # residuals below this share of the image size are rounding, not measurement
 
 
+@dataclass(frozen=True, slots=True)
+class Judgements:
+    """The four verdicts on one image."""
+
+    ks: Judgement
+    misfit: Judgement
+    pose: Judgement
+    plausible: Judgement
+
+    def under(self, policy: PolicyName) -> Judgement:
+        """Return the verdict of a policy with the reasons of its members."""
+        camera = [self.misfit, self.pose, self.plausible]
+        members: dict[PolicyName, list[Judgement]] = {
+            "paper": [self.ks],
+            "camera": camera,
+            "full": [*camera, self.ks],
+        }
+        return combine(members[policy])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraOpinion:
+    """What was decided about an image's camera after peeling.
+
+    num_tested: inliers that the final tests used.           shared: the reason that its camera as a whole is at fault.
+    """
+
+    misfit: Misfit
+    advised_camera_model: str | None
+    num_tested: int
+    shared: Reason | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAudit:
     """What the audit knows about one image.
 
-    inliers: the 2D-3D inliers.          residuals_px: (n, 2) observed - projected.       pose_offset_px: METHOD.md 6.
+    inliers: the 2D-3D inliers.          residuals_px: (n, 2) observed - projected.       pose_offset_px: method.md 6.
     track_length: (n,) audited observations of each inlier's track; None where the points are independent of the image.
     noise, tests: under the chosen noise model.          constant, constant_tests: one scale for all raw residuals.
-    ks: the paper's verdict.                             judgement: the verdict of the policy, with all reasons.
+    facts, opinion: on the camera, as the model stands and after peeling; both None without inliers.
+    judgement: the verdict of the policy, with the reasons of its members.
     """
 
     inliers: InlierSet
@@ -35,7 +75,9 @@ class ImageAudit:
     tests: NormalityTests
     constant: ImageNoise
     constant_tests: NormalityTests
-    ks: Judgement
+    facts: CameraFacts | None
+    opinion: CameraOpinion | None
+    judgements: Judgements
     judgement: Judgement
 
     @property
@@ -50,19 +92,20 @@ class ImageAudit:
 
 
 def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> ImageAudit:
-    """Audit one image on its own, its 3D points taken as given: noise model ``constant``.
+    """Audit one image on its own, its 3D points taken as independent of it: noise model ``constant``.
 
     Parameters
     ----------
     inliers : observed points and the 3D points they belong to; observations that turn out to be behind the camera or
-        without a finite projection are counted and left out, as METHOD.md section 1 says
+        without a finite projection are counted and left out, as method.md section 1 says
     config : thresholds; the defaults when None. Its ``noise`` is not used: other noise models need the tracks of the
         whole model (`audit.ModelAuditor`)
 
     Notes
     -----
-    With points that were triangulated from this very image the residuals are shrunk (METHOD.md section 3a).
+    With points that were triangulated from this very image the residuals are shrunk (method.md section 3a).
     """
+    config = config or AuditConfig()
     part = image_residuals(inliers.image, inliers.xy_px, inliers.xyz_world, inliers.point_idx)
     rows = part.inlier_row
     kept = InlierSet(
@@ -75,7 +118,39 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
         num_nonfinite=inliers.num_nonfinite + part.num_nonfinite,
     )
     constant = constant_noise(part.residuals_px)
-    return judged(kept, part.residuals_px, part.pose_offset_px, constant, constant, None, config or AuditConfig())
+    camera = inliers.image.camera
+    shape = None if camera is None else CameraShape.of(camera)
+    facts, opinion = None, None
+    if shape is not None:
+        sigma_px = constant.sigma_constant_px
+        facts = camera_facts(shape, kept.xy_px, part.xyz_cam.T, part.residuals_px, sigma_px, config.grid)
+    if facts is not None:
+        opinion = opinion_of(
+            facts,
+            facts.misfit,
+            Significance.of([facts.misfit]).q[0],
+            part.xyz_cam.T,
+            part.residuals_px,
+            sigma_px,
+            config,
+        )
+    return judged(kept, part.residuals_px, part.pose_offset_px, constant, constant, None, facts, opinion, config)
+
+
+def opinion_of(
+    facts: CameraFacts,
+    tests: MisfitTests,
+    q: FloatArray,
+    xyz_cam: FloatArray,
+    residuals_px: FloatArray,
+    sigma_px: float,
+    config: AuditConfig,
+) -> CameraOpinion:
+    """Form the opinion from the final tests, their q (6,), and the points (n, 3) and residuals (2, n) they used."""
+    tau_px = config.tau_px(sigma_px)
+    misfit = find_misfit(tests, q, num_observations=len(xyz_cam), sigma_px=sigma_px, alpha=config.alpha, tau_px=tau_px)
+    advice = image_advice(facts, misfit, xyz_cam, residuals_px, alpha=config.alpha, tau_px=tau_px)
+    return CameraOpinion(misfit, advice, len(xyz_cam))
 
 
 def judged(
@@ -85,12 +160,14 @@ def judged(
     constant: ImageNoise,
     chosen: ImageNoise,
     track_length: IntArray | None,
+    facts: CameraFacts | None,
+    opinion: CameraOpinion | None,
     config: AuditConfig,
 ) -> ImageAudit:
     """Test the chosen and the constant noise model's standardised residuals and judge; residuals_px is (2, n)."""
     tests = normality_tests(chosen.z)
     constant_tests = tests if chosen is constant else normality_tests(constant.z)
-    ks = _judge(inliers, residuals_px, chosen, tests, config)
+    judgements = _judge(inliers, residuals_px, pose_offset_px, chosen, tests, facts, opinion, config)
     return ImageAudit(
         inliers,
         residuals_px.T,
@@ -100,21 +177,53 @@ def judged(
         tests,
         constant,
         constant_tests,
-        ks,
-        combine([ks]),
+        facts,
+        opinion,
+        judgements,
+        judgements.under(config.policy),
     )
 
 
 def _judge(
-    inliers: InlierSet, residuals_px: FloatArray, noise: ImageNoise, tests: NormalityTests, config: AuditConfig
-) -> Judgement:
-    """Return the paper's verdict, or undetermined with the first reason that stands in its way."""
-    obstacle = (
-        _unusable(inliers.image) or _too_few(residuals_px, noise, config) or _no_noise(inliers, residuals_px, noise)
+    inliers: InlierSet,
+    residuals_px: FloatArray,
+    pose_offset_px: float,
+    noise: ImageNoise,
+    tests: NormalityTests,
+    facts: CameraFacts | None,
+    opinion: CameraOpinion | None,
+    config: AuditConfig,
+) -> Judgements:
+    """Return all four verdicts; each is undetermined with the first reason that stands in its way."""
+    unusable = _unusable(inliers.image)
+    if unusable is not None:
+        nothing = Judgement(Verdict.UNDETERMINED, (unusable,))
+        return Judgements(nothing, nothing, nothing, nothing)
+    num_inliers = residuals_px.shape[1]
+    exact = _exact(inliers, residuals_px)
+    no_ks = _too_few("standardised", len(noise.z), num_inliers, config) or exact or _no_noise(noise)
+    ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha)
+    if no_ks is not None:
+        ks = Judgement(Verdict.UNDETERMINED, (no_ks,))
+    limits = _limits(config)
+    if facts is None or opinion is None:
+        nothing = Judgement(Verdict.UNDETERMINED, (_few("inliers", num_inliers, config),))
+        return Judgements(ks, nothing, judge_pose(pose_offset_px, num_inliers, limits), nothing)
+    no_misfit = _too_few("clean", opinion.num_tested, num_inliers, config) or exact
+    misfit = judge_misfit(opinion.misfit)
+    if no_misfit is not None:
+        misfit = Judgement(Verdict.UNDETERMINED, (no_misfit,))
+    elif opinion.shared is not None and misfit.verdict is Verdict.REJECTED:
+        misfit = Judgement(Verdict.REJECTED, (opinion.shared, *misfit.reasons))
+    plausible = judge_plausible(
+        facts.shape.plausibility,
+        facts.identifiability,
+        coverage=facts.coverage,
+        occupied_cells=facts.occupied_cells,
+        num_inliers=num_inliers,
+        limits=limits,
     )
-    if obstacle:
-        return Judgement(Verdict.UNDETERMINED, (obstacle,))
-    return judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha)
+    return Judgements(ks, misfit, judge_pose(pose_offset_px, num_inliers, limits), plausible)
 
 
 def _unusable(image: ImageRecord) -> Reason | None:
@@ -132,20 +241,38 @@ def _unusable(image: ImageRecord) -> Reason | None:
     return None
 
 
-def _too_few(residuals_px: FloatArray, noise: ImageNoise, config: AuditConfig) -> Reason | None:
-    if len(noise.z) >= config.min_observations:
+def _few(what: str, num: int, config: AuditConfig) -> Reason:
+    return Reason(ReasonCode.TOO_FEW_OBSERVATIONS, f"{num} {what}, {config.min_observations} needed")
+
+
+def _too_few(kind: str, num: int, num_inliers: int, config: AuditConfig) -> Reason | None:
+    if num >= config.min_observations:
         return None
-    return Reason(
-        ReasonCode.TOO_FEW_OBSERVATIONS,
-        f"{len(noise.z)} standardised of {residuals_px.shape[1]} inliers, {config.min_observations} needed",
-    )
+    return _few("inliers" if num == num_inliers else f"{kind} of {num_inliers} inliers", num, config)
 
 
-def _no_noise(inliers: InlierSet, residuals_px: FloatArray, noise: ImageNoise) -> Reason | None:
-    """What makes the residuals no measurements, or their scale unknown."""
-    camera, largest = inliers.image.camera, float(np.abs(residuals_px).max())
+def _exact(inliers: InlierSet, residuals_px: FloatArray) -> Reason | None:
+    """What makes the 2D points no measurements."""
+    camera, largest = inliers.image.camera, float(np.abs(residuals_px).max(initial=0.0))
     if camera is not None and largest <= _EXACT_SHARE * max(camera.width, camera.height):
         return Reason(ReasonCode.EXACT_PROJECTIONS, f"largest residual {largest:.2g} px")
-    if not np.isfinite(noise.z).all():
-        return Reason(ReasonCode.NOISE_NOT_FITTED, f"{len(noise.z)} observations")
     return None
+
+
+def _no_noise(noise: ImageNoise) -> Reason | None:
+    if np.isfinite(noise.z).all():
+        return None
+    return Reason(ReasonCode.NOISE_NOT_FITTED, f"{len(noise.z)} observations")
+
+
+def _limits(config: AuditConfig) -> PlausibilityLimits:
+    return PlausibilityLimits(
+        min_focal_over_size=config.min_focal_over_size,
+        max_focal_over_size=config.max_focal_over_size,
+        max_sd_focal_rel=config.max_sd_focal_rel,
+        min_k1_sds=config.min_k1_sds,
+        min_coverage=config.min_coverage,
+        min_occupied_cells=config.min_occupied_cells,
+        min_observations=config.min_observations,
+        max_pose_offset_px=config.pose_offset_threshold_px,
+    )

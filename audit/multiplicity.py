@@ -1,4 +1,4 @@
-"""What is left of a p-value when many were looked at? METHOD.md section 7.
+"""What is left of a p-value when many were looked at? method.md section 7.
 
 Holm over the hypotheses of one image, Benjamini-Hochberg over the images of one model.
 """

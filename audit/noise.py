@@ -1,4 +1,4 @@
-"""How large is the noise of one image? Robust variance fits (METHOD.md section 2, (1); the paper's P5, P9 to P12)."""
+"""How large is the noise of one image? Robust variance fits (method.md section 2, (1); the paper's P5, P9 to P12)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def fit_constant_variance(sq_residuals_px2: FloatArray) -> VarianceFit:
 
     Notes
     -----
-    The fixed point of METHOD.md section 2's Fisher scoring with a = 0 is the root of
+    The fixed point of method.md section 2's Fisher scoring with a = 0 is the root of
     mean(min(y / theta, c^2)) = kappa. In u = 1 / theta the left side is increasing, concave and piecewise linear, so
     Newton from below reaches the root exactly after finitely many steps. All y = 0: undetermined.
     """
@@ -77,11 +77,11 @@ def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> Var
 
     Notes
     -----
-    METHOD.md section 2: Fisher scoring on winsorised squares. Its fixed points solve
+    method.md section 2: Fisher scoring on winsorised squares. Its fixed points solve
     sum A_j (min(y_j / s_j, c^2) / kappa - 1) / s_j = 0 with s = A theta, or have theta_2 = 0 and a non-positive second
     component. The boundaries theta_2 = 0 and theta_1 = 0 are tried first (both are common, and there the equation is
     that of a constant), then Newton with scoring steps where Newton leaves the region. Where the paper says IRLS
-    without naming weights, this is our choice; METHOD.md says why.
+    without naming weights, this is our choice; method.md says why.
     """
     y = np.atleast_2d(sq_residuals_px2)
     constant = fit_constant_variance(y)
@@ -143,7 +143,7 @@ def _next_theta(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tupl
 
 
 def scoring_step(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:
-    """One step of METHOD.md section 2 as it is written: winsorised pseudo-responses, rows weighted 1 / s, NNLS.
+    """One step of method.md section 2 as it is written: winsorised pseudo-responses, rows weighted 1 / s, NNLS.
 
     y is (k, m) or (m,), predictor (m,).
     """

@@ -1,4 +1,4 @@
-"""Noise belongs to tracks: predict an observation from the rest of its track (METHOD.md section 3b, (4) and (5)).
+"""Noise belongs to tracks: predict an observation from the rest of its track (method.md section 3b, (4) and (5)).
 
 Track variances are s0^2 nu0 / chi^2(nu0) over a model. Given the rest of its track, a whitened residual is then
 bivariate t; `student_to_normal` maps it to two standard normal numbers.
@@ -46,7 +46,7 @@ def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: Int
 
     Notes
     -----
-    With P = nu0 s0^2, B = P + c and nu = nu0 + nu_k the log likelihood of METHOD.md (4) is
+    With P = nu0 s0^2, B = P + c and nu = nu0 + nu_k the log likelihood of method.md (4) is
     sum ln nu + nu / 2 ln B - (nu / 2 + 1) ln(B + q): two logarithms an observation, and a 2 x 2 Hessian in closed
     form. Newton on (ln nu0, ln P) from a coarse grid on a systematic subsample; damped where it does not ascend.
     """
@@ -160,10 +160,13 @@ class Prediction:
 
 def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: IntArray) -> Prediction:
     """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4)."""
-    distinct, row = np.unique(other_dof, return_inverse=True)
+    distinct = np.flatnonzero(np.bincount(other_dof))  # small positive integers: no need to sort two million of them
+    row_of = np.zeros(int(distinct[-1]) + 1 if distinct.size else 1, dtype=np.int64)
+    row_of[distinct] = np.arange(distinct.size)
+    row = row_of[other_dof]
     nu = prior.nu0 + distinct.astype(np.float64)
     scale_sq = (prior.nu0 * prior.s0_px**2 + other_sq_px2) / nu[row]
-    return Prediction(np.sqrt(scale_sq), nu, row.astype(np.int64))
+    return Prediction(np.sqrt(scale_sq), nu, row)
 
 
 class StudentToNormal:

@@ -1,4 +1,4 @@
-"""Which observations are inliers, and what is left of each after projection (METHOD.md section 1)."""
+"""Which observations are inliers, and what is left of each after projection (method.md section 1)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ImageResiduals:
 
     @property
     def pose_offset_px(self) -> float:
-        """RMS residual that moving the pose alone would remove (METHOD.md section 6), NaN without inliers."""
+        """RMS residual that moving the pose alone would remove (method.md section 6), NaN without inliers."""
         return pose_offset_px(self.residuals_px, self.jacobian_cam, self.xyz_cam)
 
 
@@ -73,7 +73,7 @@ def image_residuals(
 
     Notes
     -----
-    METHOD.md section 1: an observation enters if its point exists, Zc > 0 (spherical cameras: Xc != 0) and its
+    method.md section 1: an observation enters if its point exists, Zc > 0 (spherical cameras: Xc != 0) and its
     projection is finite. Observations that are themselves not finite count as not finite.
     """
     linked = point_idx >= 0

@@ -9,8 +9,11 @@ from dataclasses import asdict
 
 import numpy as np
 
-from audit.coverage import coverage, occupied_cells
-from audit.image_audit import ImageAudit
+from audit.camera_audit import CameraAudit
+from audit.camera_facts import CameraFacts
+from audit.image_audit import ImageAudit, Judgements
+from audit.misfit import GROUPS, MisfitTests
+from audit.misfit_verdict import Misfit
 from audit.standardise import ModelTracks
 from audit.stored_errors import StoredErrors
 from audit.table import ModelLabels
@@ -20,11 +23,11 @@ from loaders.model import Finding, SparseModel
 Row = dict[str, object]
 
 
-def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str, grid: int) -> Row:
+def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
     """Return the row of one image; ``ks_q`` needs all rows of the model and is left NaN."""
     inliers, image, camera = audit.inliers, audit.image, audit.image.camera
     num_inliers = len(inliers.xy_px)
-    width, height = (camera.width, camera.height) if camera else (0, 0)
+    facts = audit.facts
     lost = inliers.num_behind + inliers.num_nonfinite + inliers.num_dangling
     return {
         **asdict(labels),
@@ -44,15 +47,22 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str, grid: int
         "num_unverifiable": num_inliers - len(audit.noise.z),
         "num_standardised": len(audit.noise.z),
         "mean_track_length": math.nan if audit.track_length is None or not num_inliers else audit.track_length.mean(),
-        "coverage": coverage(inliers.xy_px, width, height),
-        "occupied_cells": occupied_cells(inliers.xy_px, width, height, grid),
+        "coverage": facts.coverage if facts else (0.0 if camera else math.nan),
+        "occupied_cells": facts.occupied_cells if facts else (0 if camera else None),
         **_error_summary(audit),
         "noise_model": noise_name,
         **_noise_columns(audit),
         **_test_columns(audit),
+        **_misfit_columns(facts.misfit if facts else None),
+        **_cause_columns(audit.opinion.misfit if audit.opinion else None),
+        "advised_camera_model": audit.opinion.advised_camera_model if audit.opinion else None,
         "pose_offset_px": audit.pose_offset_px,
+        **_camera_columns(facts),
         "verdict": str(audit.verdict),
-        "verdict_ks": str(audit.ks.verdict),
+        "verdict_ks": str(audit.judgements.ks.verdict),
+        "verdict_misfit": str(audit.judgements.misfit.verdict),
+        "verdict_pose": str(audit.judgements.pose.verdict),
+        "plausible": str(audit.judgements.plausible.verdict),
         "reasons": [str(reason) for reason in audit.judgement.reasons],
     }
 
@@ -120,18 +130,75 @@ def _test_columns(audit: ImageAudit) -> Row:
     }
 
 
+def _misfit_columns(tests: MisfitTests | None) -> Row:
+    """Return p, px and rank of every group; the rank only where it is known."""
+    row: Row = {}
+    for group in GROUPS:
+        test = tests[group] if tests else None
+        row[f"misfit_{group}_p"] = test.p if test else math.nan
+        row[f"misfit_{group}_px"] = test.px if test else math.nan
+        row[f"misfit_{group}_rank"] = test.rank if test else None
+    return row
+
+
+def _cause_columns(misfit: Misfit | None) -> Row:
+    return {
+        "misfit_group": str(misfit.group) if misfit and misfit.group else None,
+        "misfit_px": misfit.px if misfit else math.nan,
+        "misfit_q": misfit.of_q if misfit else math.nan,
+    }
+
+
+def _camera_columns(facts: CameraFacts | None) -> Row:
+    known = facts.identifiability if facts else None
+    plausible = facts.shape.plausibility if facts else None
+    return {
+        "sd_focal_px": known.sd_focal_px if known else math.nan,
+        "sd_focal_rel": known.sd_focal_rel if known else math.nan,
+        "sd_k1": known.sd_k1 if known else math.nan,
+        "focal_over_size": plausible.focal_over_size if plausible else math.nan,
+        "folds_over": plausible.folds_over if plausible else None,
+        "expected_error_px": facts.expected_error_px if facts else math.nan,
+    }
+
+
+def camera_row(audit: CameraAudit, labels: ModelLabels) -> Row:
+    """Return the row of one camera."""
+    camera = audit.camera
+    return {
+        **asdict(labels),
+        "camera_id": camera.camera_id,
+        "camera_model": camera.model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "params": camera.params,
+        "num_images": len(audit.image_idxs),
+        "num_points3d": audit.num_points,
+        "num_observations": audit.num_observations,
+        **_misfit_columns(audit.misfit.tests),
+        **_cause_columns(audit.misfit),
+        "advised_camera_model": audit.advised_camera_model,
+        "misfit_material": bool(audit.misfit.material),
+    }
+
+
 def model_row(
     model: SparseModel,
     labels: ModelLabels,
     tracks: ModelTracks,
     errors: StoredErrors,
     findings: Sequence[Finding],
-    judgements: Sequence[tuple[Judgement, Judgement]],
+    judgements: Sequence[tuple[Judgement, Judgements]],
 ) -> Row:
-    """Return the row of one model; ``judgements`` holds each image's (policy, ks)."""
+    """Return the row of one model; ``judgements`` holds each image's judgement of the policy and of each member."""
     total_sq = tracks.statistics.total_sq_px2
-    policy = Counter(pair[0].verdict for pair in judgements)
-    ks = Counter(pair[1].verdict for pair in judgements)
+    counts = {
+        "": Counter(policy.verdict for policy, _ in judgements),
+        "_ks": Counter(each.ks.verdict for _, each in judgements),
+        "_misfit": Counter(each.misfit.verdict for _, each in judgements),
+        "_pose": Counter(each.pose.verdict for _, each in judgements),
+        "_plausible": Counter(each.plausible.verdict for _, each in judgements),
+    }
     return {
         **asdict(labels),
         "file_format": model.file_format,
@@ -147,7 +214,6 @@ def model_row(
         "noise_s0_px": tracks.prior.s0_px,
         "removable_share": tracks.statistics.removable_sq_px2 / total_sq if total_sq > 0 else math.nan,
         "num_nonstationary_images": int(np.count_nonzero(tracks.nonstationary)),
-        **{f"num_{verdict}": policy[verdict] for verdict in Verdict},
-        **{f"num_{verdict}_ks": ks[verdict] for verdict in Verdict},
+        **{f"num_{verdict}{name}": count[verdict] for name, count in counts.items() for verdict in Verdict},
         "findings": list(findings),
     }

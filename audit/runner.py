@@ -1,4 +1,4 @@
-"""How are many models audited? One by one or in processes, each model's tables into a sink as they are finished.
+"""How are many models audited? Each by itself, wherever that happens, and its tables into a sink as it is finished.
 
 The content of a run does not depend on the order in which models finish: each model is audited by itself, from its
 own files and the config.
@@ -6,63 +6,21 @@ own files and the config.
 
 from __future__ import annotations
 
-import multiprocessing
-import multiprocessing.connection
-import os
-import signal
-import threading
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from typing import Protocol
 
 import pyarrow as pa
 from threadpoolctl import threadpool_limits
 
 from audit.config import AuditConfig
-from audit.engine import audit_model
-from audit.table import ModelLabels
-from loaders import LoadError, ModelRef, open_model
-from loaders.input_state import InputState, input_stamp, read_input_state
+from audit.schedule.processes import in_processes, planned
+from audit.schedule.task import Audited, AuditFunction, Failure, Outcome, Task, Unchanged, audit_one, too_large
+from loaders import LoadError, ModelRef
+from loaders.input_state import InputState, input_stamp
 
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """A model that could not be audited: its location as given, and one line that says why."""
-
-    location: str
-    message: str
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One model to audit. known_digest: of the input it was last audited with; None when there is no such audit."""
-
-    ref: ModelRef
-    config: AuditConfig
-    known_digest: str | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Audited:
-    """The tables of one model (by name), the input they were made from, and how long it took."""
-
-    state: InputState
-    tables: Mapping[str, pa.Table]
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class Unchanged:
-    """The files were touched, their content is what it was: the finished tables hold."""
-
-
-Outcome = Audited | Unchanged | Failure
-AuditFunction = Callable[[Task], Outcome]
+__all__ = ["AuditFunction", "Audited", "Failure", "Outcome", "Sink", "Task", "Unchanged", "audit_many", "audit_one"]
 
 
 class Sink(Protocol):
@@ -78,27 +36,6 @@ class Sink(Protocol):
         """Forget a model."""
 
 
-def audit_one(task: Task) -> Outcome:
-    """Load and audit one model; a model that cannot be read is a Failure, any other error is raised."""
-    start = time.perf_counter()
-    ref = task.ref
-    try:
-        state = read_input_state(ref.location)
-        if state.digest == task.known_digest:
-            return Unchanged()
-        model = open_model(ref.location)
-    except LoadError as error:
-        return Failure(ref.model_path, str(error))
-    labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
-    try:
-        audited = audit_model(model, task.config, labels)
-    except BaseException as error:
-        error.add_note(f"while auditing {ref.model_path}")
-        raise
-    tables = {"images": audited.images, "models": audited.models}
-    return Audited(state, tables, time.perf_counter() - start)
-
-
 def audit_many(
     refs: Sequence[ModelRef],
     config: AuditConfig,
@@ -106,7 +43,11 @@ def audit_many(
     jobs: int,
     sink: Sink,
     on_done: Callable[[ModelRef], None] = lambda _: None,
+    on_skip: Callable[[ModelRef], None] | None = None,
     audit: AuditFunction = audit_one,
+    observations: bool = False,
+    dask: str | None = None,
+    max_model_bytes: int | None = None,
 ) -> list[Failure]:
     """Audit models and hand their tables to a sink.
 
@@ -117,112 +58,75 @@ def audit_many(
     jobs : number of processes; 1 audits in this one
     sink : models that it has finished from the same input are not audited again
     on_done : called once per model, in the order in which they finish
-    audit : what to do with one model; must be importable by name when jobs > 1
+    on_skip : called in place of ``on_done``, before any model is audited, for models that need no audit
+    audit : what to do with one model; must be importable by name unless it runs in this process
+    observations : whether to make the tables of observations too, one row per inlier
+    dask : address of a Dask scheduler whose workers audit, or "local": ``jobs`` Dask workers on this machine
+    max_model_bytes : a larger model is not loaded but becomes a Failure
 
     Returns
     -------
     list of Failure
         Models that could not be read, or whose process died twice, in the order of ``refs``. Their earlier tables are
         removed from the sink.
+
+    Raises
+    ------
+    ClusterError
+        The Dask cluster cannot be used, or was lost.
     """
     failures: dict[str, Failure] = {}
     tasks = []
     for ref in refs:
         known = sink.finished(ref)
         if known is not None and _is_untouched(ref, known):
-            on_done(ref)
+            (on_skip or on_done)(ref)
         else:
-            tasks.append(Task(ref, config, known.digest if known else None))
-    run = _in_this_process(tasks, audit) if min(jobs, len(tasks)) <= 1 else _in_processes(tasks, jobs, audit)
-    for task, outcome in run:
-        if isinstance(outcome, Failure):
-            failures[task.ref.key] = outcome
-            sink.drop(task.ref.key)
-        elif isinstance(outcome, Audited):
-            sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
-        on_done(task.ref)
+            if max_model_bytes is not None and ref.num_bytes > max_model_bytes:
+                failures[ref.key] = too_large(ref, max_model_bytes)
+                sink.drop(ref.key)
+                on_done(ref)
+                continue
+            tasks.append(Task(ref, config, known.digest if known else None, observations))
+    with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
+        for task, outcome in outcomes:
+            if isinstance(outcome, Failure):
+                failures[task.ref.key] = outcome
+                sink.drop(task.ref.key)
+            elif isinstance(outcome, Audited):
+                sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
+            on_done(task.ref)
     return [failures[ref.key] for ref in refs if ref.key in failures]
+
+
+def _outcomes(
+    tasks: Sequence[Task], jobs: int, audit: AuditFunction, dask: str | None
+) -> Generator[tuple[Task, Outcome]]:
+    """Audit in this process, in processes or on a cluster; elsewhere the largest models go first."""
+    if not tasks:
+        return
+    if dask is None and jobs <= 1:
+        yield from _in_this_process(tasks, audit)
+        return
+    plan = planned(tasks, jobs)
+    if dask is not None:
+        from audit.schedule.cluster import in_cluster  # noqa: PLC0415 - imports Dask, which only this needs
+
+        yield from in_cluster([replace(task, num_processes=1) for task in plan], dask, jobs, audit)
+    elif len(plan) == 1 and plan[0].num_processes == 1:
+        yield from _in_this_process(plan, audit)
+    else:
+        yield from in_processes(plan, jobs, audit)
 
 
 def _is_untouched(ref: ModelRef, known: InputState) -> bool:
     try:
-        return input_stamp(ref.location) == known.stamp
+        return (ref.stamp or input_stamp(ref.location)) == known.stamp
     except LoadError:
         return False  # the audit itself will say what is wrong
 
 
-def _in_this_process(tasks: Sequence[Task], audit: AuditFunction) -> Iterator[tuple[Task, Outcome]]:
+def _in_this_process(tasks: Sequence[Task], audit: AuditFunction) -> Generator[tuple[Task, Outcome]]:
     with threadpool_limits(limits=1):
         for task in tasks:
             yield task, audit(task)
-
-
-def _in_processes(tasks: Sequence[Task], jobs: int, audit: AuditFunction) -> Iterator[tuple[Task, Outcome]]:
-    """Yield outcomes as they come; models that were under way when a process died are tried once more, each alone."""
-    waiting = deque(tasks)
-    while waiting:
-        suspects: list[Task] = []
-        with _pool(min(jobs, len(waiting))) as pool:
-            running: dict[Future[Outcome], Task] = {}
-            while running or (waiting and not suspects):
-                while waiting and not suspects and len(running) < 2 * jobs:
-                    task = waiting.popleft()
-                    running[_submit(pool, audit, task)] = task
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    task = running.pop(future)
-                    try:
-                        outcome = future.result()
-                    except BrokenProcessPool:
-                        suspects.append(task)
-                        continue
-                    yield task, outcome
-        for task in suspects:
-            yield task, _alone(task, audit)
-
-
-def _submit(pool: ProcessPoolExecutor, audit: AuditFunction, task: Task) -> Future[Outcome]:
-    try:
-        return pool.submit(audit, task)
-    except BrokenProcessPool as error:
-        broken: Future[Outcome] = Future()
-        broken.set_exception(error)
-        return broken
-
-
-def _alone(task: Task, audit: AuditFunction) -> Outcome:
-    with _pool(1) as pool:
-        try:
-            return _submit(pool, audit, task).result()
-        except BrokenProcessPool:
-            what = "the process that audited it died twice, the second time with no other beside it"
-            advice = "memory may be short (see dmesg); run it again where there is more"
-            return Failure(task.ref.model_path, f"{task.ref.model_path}: {what}; {advice}")
-
-
-@contextmanager
-def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Start a process pool whose workers end at once when the caller is interrupted."""
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_start_worker)
-    try:
-        yield pool
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()
-        pool.shutdown(cancel_futures=True)
-        raise
-    pool.shutdown()
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    threadpool_limits(limits=1)
-
-
-def _end_with_parent() -> None:
-    """Leave when the parent is killed: a worker holds both ends of its queue and would wait for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)

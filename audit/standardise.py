@@ -1,4 +1,4 @@
-"""From residuals to standard normal numbers under a noise model, by name (METHOD.md sections 2 and 3)."""
+"""From residuals to standard normal numbers under a noise model, by name (method.md sections 2 and 3)."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def model_tracks(
 
     Notes
     -----
-    METHOD.md section 3b: wrong poses inflate everybody's a^2. An image with pose_offset_px above the threshold is left
+    method.md section 3b: wrong poses inflate everybody's a^2. An image with pose_offset_px above the threshold is left
     out of the tracks of all others and of the prior; its own observations keep the values of the full tracks. If more
     than half of the images (with inliers) exceed it, none is left out.
     """

@@ -1,4 +1,4 @@
-"""Is the pose at the optimum of its own residuals? (METHOD.md section 6)."""
+"""Is the pose at the optimum of its own residuals? (method.md section 6)."""
 
 from __future__ import annotations
 

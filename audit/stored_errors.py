@@ -1,4 +1,4 @@
-"""Do the reprojection errors stored with the 3D points still hold? (METHOD.md section 6)."""
+"""Do the reprojection errors stored with the 3D points still hold? (method.md section 6)."""
 
 from __future__ import annotations
 

@@ -12,9 +12,21 @@ import pyarrow as pa
 
 from audit.arrow import build_table
 
-__all__ = ["IMAGES", "MODELS", "TABLES", "Column", "ModelLabels", "TableName", "build_table", "empty_table", "schema"]
+__all__ = [
+    "CAMERAS",
+    "IMAGES",
+    "MODELS",
+    "OBSERVATIONS",
+    "TABLES",
+    "Column",
+    "ModelLabels",
+    "TableName",
+    "build_table",
+    "empty_table",
+    "schema",
+]
 
-TableName = Literal["images", "models"]
+TableName = Literal["images", "cameras", "models", "observations"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +88,33 @@ _IDENTITY: Final = (
     _text("model_path", "location of the model as given, joined with the path below it"),
 )
 
+_GROUPS: Final = {
+    "radial": "radial distortion beyond r^2",
+    "tangential": "tangential distortion",
+    "affine": "aspect ratio and skew",
+    "principal_point": "principal point",
+    "rolling_shutter": "a pose that changes from row to row",
+    "smooth": "any smooth field over the image",
+}
+
+
+def _misfit() -> tuple[Column, ...]:
+    out = []
+    for group, words in _GROUPS.items():
+        out += [
+            _number(f"misfit_{group}_p", f"p-value of the score test for {words}, on the model as it stands"),
+            _px(f"misfit_{group}_px", f"RMS length of the field of {words} in the residuals, cleaned of noise"),
+            _count(f"misfit_{group}_rank", "free columns of the group; 0: the camera model has it already"),
+        ]
+    return (
+        *out,
+        _text("misfit_group", "named cause among the significant groups; for images after peeling"),
+        _px("misfit_px", "effect of misfit_group"),
+        _number("misfit_q", "q-value of misfit_group: Holm over the groups, Benjamini-Hochberg over the model"),
+        _text("advised_camera_model", "smallest COLMAP model that holds what was found, or none: and what it is"),
+    )
+
+
 IMAGES: Final[tuple[Column, ...]] = (
     *_IDENTITY,
     _id("image_id", "id as stored"),
@@ -101,7 +140,7 @@ IMAGES: Final[tuple[Column, ...]] = (
     _px("median_px", "median reprojection error |eps| over the inliers"),
     _px("p95_px", "95th percentile of the reprojection error |eps| over the inliers"),
     _px("max_px", "largest reprojection error |eps| among the inliers"),
-    _text("noise_model", "noise model behind z: track or constant"),
+    _text("noise_model", "noise model behind z: track, constant or keypoint"),
     _px("sigma_constant_px", "robust noise per axis of the raw residuals, one value for the whole image"),
     _px("sigma_d_px", "detector noise per axis, sqrt(theta_1) of the paper's model on whitened residuals"),
     _number("sigma_l", "share of the rest of the track's noise, sqrt(theta_2) of the paper's model"),
@@ -113,7 +152,10 @@ IMAGES: Final[tuple[Column, ...]] = (
     _number("ks_q", "Benjamini-Hochberg q-value of ks_p over the model's images"),
     _number("ks_fitted_p", "p-value of the same distance after centring and scaling z (Lilliefors' null)"),
     _number("ks_norm_p", "p-value of |z|^2 against the Rayleigh law, scale fitted (Lilliefors' exponential null)"),
-    _number("ks_norm_unscaled_p", "p-value of |z|^2 / 2 against Exp(1), z of the paper's noise model, nothing fitted"),
+    _number(
+        "ks_norm_unscaled_p",
+        "p-value of |z|^2 / 2 against Exp(1), nothing fitted (the paper's own use of z, with noise constant)",
+    ),
     _number("dap_stat", "D'Agostino-Pearson statistic of z"),
     _number("dap_p", "p-value of dap_stat"),
     _number("sw_stat", "Shapiro-Wilk statistic of z, at most 5000 values (every k-th observation above that)"),
@@ -128,10 +170,34 @@ IMAGES: Final[tuple[Column, ...]] = (
     _number("sw_constant_p", "sw_p under the constant noise model"),
     _number("skewness_constant", "skewness under the constant noise model"),
     _number("kurtosis_constant", "excess kurtosis under the constant noise model"),
+    *_misfit(),
     _px("pose_offset_px", "RMS residual that a change of this image's pose alone would remove; ~0 after adjustment"),
+    _px("sd_focal_px", "standard deviation of the first focal length, conditional on the points (a lower bound)"),
+    _number("sd_focal_rel", "largest sd_f / f, conditional on the points (a lower bound)"),
+    _number("sd_k1", "standard deviation of the first distortion parameter, conditional on the points"),
+    _number("focal_over_size", "first focal length / max(width, height)"),
+    _bool("folds_over", "whether the distortion folds inside the image"),
+    _px("expected_error_px", "expected error of a measurement with this camera, median over a 16 x 16 grid"),
     _text("verdict", "accepted, rejected or undetermined under the policy of the run"),
     _text("verdict_ks", "rejected when ks_p < alpha; undetermined with too few standardised observations"),
-    _texts("reasons", "why not accepted: code, colon, and the number that triggered it"),
+    _text("verdict_misfit", "rejected when a group has q < alpha and an effect above min_effect, after peeling"),
+    _text("verdict_pose", "rejected when pose_offset_px is above its threshold"),
+    _text("plausible", "rejected when this cannot be a camera, undetermined when the image says too little of it"),
+    _texts("reasons", "why not accepted, and remarks: code, colon, and the number that triggered it"),
+)
+
+CAMERAS: Final[tuple[Column, ...]] = (
+    *_IDENTITY,
+    _id("camera_id", "id as stored"),
+    _text("camera_model", "COLMAP's name of the camera model"),
+    Column("width", pa.uint32(), "px", "image width as stored"),
+    Column("height", pa.uint32(), "px", "image height as stored"),
+    Column("params", _list_of(pa.float64()), "px and 1", "camera parameters as stored, in COLMAP's order"),
+    _count("num_images", "images of this camera with inliers"),
+    _count("num_points3d", "3D points that they see"),
+    _count("num_observations", "their inliers"),
+    *_misfit(),
+    _bool("misfit_material", "whether misfit_group has q < alpha and an effect above min_effect"),
 )
 
 _FINDING: Final = pa.struct([("code", pa.string()), ("count", pa.int64()), ("text", pa.string())])
@@ -157,13 +223,42 @@ MODELS: Final[tuple[Column, ...]] = (
     _count("num_accepted", "images whose verdict is accepted"),
     _count("num_rejected", "images whose verdict is rejected"),
     _count("num_undetermined", "images whose verdict is undetermined"),
-    _count("num_accepted_ks", "images whose verdict_ks is accepted"),
-    _count("num_rejected_ks", "images whose verdict_ks is rejected"),
-    _count("num_undetermined_ks", "images whose verdict_ks is undetermined"),
+    *(
+        _count(f"num_{verdict}_{member}", f"images whose {column} is {verdict}")
+        for member, column in (
+            ("ks", "verdict_ks"),
+            ("misfit", "verdict_misfit"),
+            ("pose", "verdict_pose"),
+            ("plausible", "plausible"),
+        )
+        for verdict in ("accepted", "rejected", "undetermined")
+    ),
     Column("findings", _list_of(_FINDING), "text", "inconsistencies of the model: code, how many items, one line each"),
 )
 
-TABLES: Final[dict[TableName, tuple[Column, ...]]] = {"images": IMAGES, "models": MODELS}
+_CODED_TEXT: Final = pa.dictionary(pa.int32(), pa.string())  # millions of rows, few different texts
+
+OBSERVATIONS: Final[tuple[Column, ...]] = (
+    *(Column(column.name, _CODED_TEXT, column.unit, column.meaning) for column in _IDENTITY),
+    _id("image_id", "id as stored"),
+    Column("image_name", _CODED_TEXT, "text", "name as stored"),
+    Column("point2d_idx", pa.int64(), "id", "position among the image's 2D points as stored, from 0"),
+    Column("point3d_id", pa.uint64(), "id", "id of its 3D point as stored"),
+    _px("x_px", "observed; the centre of the first pixel is 0.5"),
+    _px("y_px", "observed; the centre of the first pixel is 0.5"),
+    _px("residual_x_px", "observed - projected"),
+    _px("residual_y_px", "observed - projected"),
+    _count("track_length", "audited observations of its 3D point"),
+    _number("z_x", "standardised residual under noise_model of the image; null where its track cannot verify it"),
+    _number("z_y", "standardised residual under noise_model of the image; null where its track cannot verify it"),
+)
+
+TABLES: Final[dict[TableName, tuple[Column, ...]]] = {
+    "images": IMAGES,
+    "cameras": CAMERAS,
+    "models": MODELS,
+    "observations": OBSERVATIONS,
+}
 
 
 def schema(table: TableName) -> pa.Schema:

@@ -1,4 +1,4 @@
-"""Residuals of a reconstruction are shrunk by their own points: undo it (METHOD.md sections 3a and 3b, (2) and (3)).
+"""Residuals of a reconstruction are shrunk by their own points: undo it (method.md sections 3a and 3b, (2) and (3)).
 
 Everything works on all observations of a model at once; ``point_idx`` ties an observation to its track.
 """

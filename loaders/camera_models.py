@@ -40,7 +40,7 @@ class CameraModel:
 
     @property
     def is_spherical(self) -> bool:
-        """Whether the camera sees directions behind it (no Zc > 0 condition, METHOD.md section 1)."""
+        """Whether the camera sees directions behind it (no Zc > 0 condition, method.md section 1)."""
         return self.name == "EQUIRECTANGULAR"
 
 

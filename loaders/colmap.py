@@ -8,7 +8,8 @@ from typing import Final
 from loaders import colmap_binary, colmap_text
 from loaders.assemble import assemble
 from loaders.errors import MissingFileError, UnreadableFileError
-from loaders.files import exists
+from loaders.files import exists, is_folder
+from loaders.locations import InputPath, parse_location
 from loaders.model import SparseModel
 from loaders.raw import FileFormat
 from loaders.twins import compare_with_text, mention_ignored_binary
@@ -26,7 +27,7 @@ def open_model(path: str | Path) -> SparseModel:
 
     Parameters
     ----------
-    path : folder with cameras, images and points3D (.bin or .txt)
+    path : folder with cameras, images and points3D (.bin or .txt); of this machine, or s3://..., gs://...
 
     Returns
     -------
@@ -38,7 +39,7 @@ def open_model(path: str | Path) -> SparseModel:
     LoadError
         Where a file is missing or cannot be read as what it should be.
     """
-    folder = Path(path)
+    folder = parse_location(path)
     file_format = file_format_of(folder)
     if file_format == "binary":
         raw = colmap_binary.read_model(folder)
@@ -49,7 +50,7 @@ def open_model(path: str | Path) -> SparseModel:
     return assemble(raw, str(path), file_format, findings)
 
 
-def file_format_of(folder: Path) -> FileFormat:
+def file_format_of(folder: InputPath) -> FileFormat:
     """Return which files of ``folder`` make up its model.
 
     Raises
@@ -69,7 +70,7 @@ def file_format_of(folder: Path) -> FileFormat:
         return "text"
     if not exists(folder):
         raise MissingFileError(str(folder), None, "a model folder", "nothing", "check the path")
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise UnreadableFileError(str(folder), None, "a model folder", "a file", "name the folder that holds the model")
     found = there["binary"] + there["text"]
     suffix = SUFFIX["text"] if len(there["text"]) > len(there["binary"]) else SUFFIX["binary"]
@@ -79,7 +80,7 @@ def file_format_of(folder: Path) -> FileFormat:
     raise MissingFileError(str(folder), None, wanted, got, f"add {', '.join(missing)}")
 
 
-def files_of(folder: Path) -> tuple[Path, ...]:
+def files_of(folder: InputPath) -> tuple[InputPath, ...]:
     """Return the files that `open_model` reads the model from, in a fixed order; errors as of `file_format_of`."""
     suffix = SUFFIX[file_format_of(folder)]
     paths = [folder / f"{name}{suffix}" for name in (*REQUIRED, *OPTIONAL)]

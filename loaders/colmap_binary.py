@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from io import BufferedReader
-from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
@@ -17,7 +16,8 @@ import numpy as np
 from loaders.arrays import IntArray, UInt32Array
 from loaders.camera_models import BY_ID
 from loaders.errors import LoadError, MalformedFileError, Position, TruncatedFileError
-from loaders.files import exists, open_input, read_bytes
+from loaders.files import exists, open_input, read_bytes, reading
+from loaders.locations import InputPath
 from loaders.model import CameraTable
 from loaders.raw import (
     CAMERA_SENSOR,
@@ -57,7 +57,7 @@ _NAME_CHUNK: Final = 256
 _RECOPY: Final = "copy or export the reconstruction again"
 
 
-def read_model(folder: Path) -> RawModel:
+def read_model(folder: InputPath) -> RawModel:
     """Read all binary files of the model in ``folder``; LoadError where one of them cannot be read."""
     return RawModel(
         cameras=read_cameras(folder / "cameras.bin"),
@@ -71,7 +71,7 @@ def read_model(folder: Path) -> RawModel:
 class _Cursor:
     """A position in a small file that is held in memory."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: InputPath) -> None:
         self.path = path
         self.data = read_bytes(path)
         self.offset = 0
@@ -100,7 +100,7 @@ _Record = TypeVar("_Record")
 
 
 def _read_records(
-    path: Path, kind: str, min_size: int, read_one: Callable[[_Cursor], tuple[int, _Record]]
+    path: InputPath, kind: str, min_size: int, read_one: Callable[[_Cursor], tuple[int, _Record]]
 ) -> list[_Record]:
     """Read a small file: a count, then records that begin with an id that is theirs alone."""
     cursor = _Cursor(path)
@@ -115,7 +115,7 @@ def _read_records(
     return list(records.values())
 
 
-def read_cameras(path: Path) -> CameraTable:
+def read_cameras(path: InputPath) -> CameraTable:
     """Read cameras.bin."""
     return camera_table(_read_records(path, "camera", _CAMERA.size, _read_camera))
 
@@ -134,15 +134,11 @@ def _read_camera(cursor: _Cursor) -> tuple[int, RawCamera]:
     return camera_id, camera
 
 
-def read_images(path: Path) -> RawImages:
+def read_images(path: InputPath) -> RawImages:
     """Read images.bin, one image in memory at a time, keeping of its POINTS2D the linked ones."""
     file, size = open_input(path)
-    with file:
-        head = file.read(_COUNT.size)
-        if len(head) < _COUNT.size:
-            raise _truncated(path, 0, "the number of images", _COUNT.size, len(head))
-        (count,) = _COUNT.unpack(head)
-        _check_count(path, 0, (count, "images"), _IMAGE.size + 1 + _COUNT.size, size - _COUNT.size)
+    with file, reading(path):
+        count = num_images(path, file.read(_COUNT.size), size)
         images: dict[int, RawImage] = {}
         offset = _COUNT.size
         for _ in range(count):
@@ -155,7 +151,16 @@ def read_images(path: Path) -> RawImages:
     return image_columns(list(images.values()))
 
 
-def _read_image(file: BufferedReader, path: Path, start: int, size: int) -> tuple[RawImage, int]:
+def num_images(path: InputPath, head: bytes, size: int) -> int:
+    """Return what the first eight bytes of an images.bin of ``size`` bytes say; LoadError where it is too small."""
+    if len(head) < _COUNT.size:
+        raise _truncated(path, 0, "the number of images", _COUNT.size, len(head))
+    (count,) = _COUNT.unpack(head)
+    _check_count(path, 0, (count, "images"), _IMAGE.size + 1 + _COUNT.size, size - _COUNT.size)
+    return int(count)
+
+
+def _read_image(file: BufferedReader, path: InputPath, start: int, size: int) -> tuple[RawImage, int]:
     """Read the image whose record begins at ``start``; return it and where its record ends."""
     head = file.read(_IMAGE.size)
     if len(head) < _IMAGE.size:
@@ -190,7 +195,7 @@ def _read_image(file: BufferedReader, path: Path, start: int, size: int) -> tupl
     return image, offset + len(data)
 
 
-def _read_name(file: BufferedReader, path: Path, start: int, image_id: int) -> tuple[str, int]:
+def _read_name(file: BufferedReader, path: InputPath, start: int, image_id: int) -> tuple[str, int]:
     r"""Return the name that begins at ``start`` and where the byte behind its NUL lies.
 
     Bytes that are not UTF-8 become ``\xNN``: names go into Parquet text columns.
@@ -210,7 +215,7 @@ def _read_name(file: BufferedReader, path: Path, start: int, image_id: int) -> t
             raise TruncatedFileError(str(path), Position("byte", start), wanted, got, _RECOPY)
 
 
-def read_points(path: Path) -> RawPoints:
+def read_points(path: InputPath) -> RawPoints:
     """Read points3D.bin."""
     data = read_bytes(path)
     if len(data) < _COUNT.size:
@@ -238,7 +243,7 @@ def read_points(path: Path) -> RawPoints:
     )
 
 
-def _point_starts(data: bytes, count: int, path: Path) -> tuple[IntArray, int]:
+def _point_starts(data: bytes, count: int, path: InputPath) -> tuple[IntArray, int]:
     """Return where each record begins and where the last one ends: record = 51 + 8 * track length bytes."""
     starts = [0] * count
     offset, size = _COUNT.size, len(data)
@@ -270,7 +275,7 @@ def _gather_tracks(data: bytes, starts: IntArray, lengths: IntArray) -> UInt32Ar
     return windows[at].view("<u4").reshape(-1, 2)
 
 
-def read_rigs(path: Path) -> tuple[RawRig, ...]:
+def read_rigs(path: InputPath) -> tuple[RawRig, ...]:
     """Read rigs.bin (COLMAP 3.12 and newer)."""
     return tuple(_read_records(path, "rig", _RIG.size, _read_rig))
 
@@ -293,7 +298,7 @@ def _read_rig(cursor: _Cursor) -> tuple[int, RawRig]:
     return rig_id, RawRig(rig_id, sensors)
 
 
-def read_frames(path: Path) -> tuple[RawFrame, ...]:
+def read_frames(path: InputPath) -> tuple[RawFrame, ...]:
     """Read frames.bin (COLMAP 3.12 and newer)."""
     return tuple(_read_records(path, "frame", _FRAME.size, _read_frame))
 
@@ -307,7 +312,7 @@ def _read_frame(cursor: _Cursor) -> tuple[int, RawFrame]:
     return frame_id, RawFrame(frame_id, rig_id, tuple(pose), images)
 
 
-def _check_count(path: Path, offset: int, items: tuple[int, str], min_size: int, num_left: int) -> None:
+def _check_count(path: InputPath, offset: int, items: tuple[int, str], min_size: int, num_left: int) -> None:
     """Raise where that many items of at least ``min_size`` bytes cannot fit into what is left of the file."""
     count, kind = items
     if count * min_size > num_left:
@@ -316,14 +321,14 @@ def _check_count(path: Path, offset: int, items: tuple[int, str], min_size: int,
         raise TruncatedFileError(str(path), Position("byte", offset), wanted, f"{num_left} bytes", advice)
 
 
-def _check_end(path: Path, offset: int, size: int, kind: str) -> None:
+def _check_end(path: InputPath, offset: int, size: int, kind: str) -> None:
     if offset != size:
         got = f"{size - offset} more bytes"
         wanted = f"the end of the file after the last of its {kind}"
         raise MalformedFileError(str(path), Position("byte", offset), wanted, got, f"the file is damaged: {_RECOPY}")
 
 
-def _truncated(path: Path, offset: int, what: str, num_wanted: int, num_left: int) -> LoadError:
+def _truncated(path: InputPath, offset: int, what: str, num_wanted: int, num_left: int) -> LoadError:
     wanted = f"{what} ({num_wanted} bytes)"
     got = f"{max(num_left, 0)} bytes before the end of the file"
     return TruncatedFileError(str(path), Position("byte", offset), wanted, got, f"the file is cut short: {_RECOPY}")

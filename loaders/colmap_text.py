@@ -6,7 +6,6 @@ Source: COLMAP 4.2 ``src/colmap/scene/reconstruction_io_text.cc``. Unlike COLMAP
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -15,6 +14,7 @@ from loaders.arrays import UInt64Array
 from loaders.camera_models import BY_NAME
 from loaders.errors import Position
 from loaders.files import exists
+from loaders.locations import InputPath
 from loaders.model import CameraTable, Finding
 from loaders.raw import (
     CAMERA_SENSOR,
@@ -41,7 +41,7 @@ _EXACT: Final = 2.0**53
 _HEADER: Final = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 
-def read_model(folder: Path) -> RawModel:
+def read_model(folder: InputPath) -> RawModel:
     """Read all text files of the model in ``folder``; LoadError where one of them cannot be read."""
     camera_file = read_text(folder / "cameras.txt")
     cameras = read_cameras(camera_file)
@@ -159,7 +159,7 @@ def _point_ids(file: TextFile, line: int, fields: list[bytes], as_float: np.ndar
     return np.array(ids, dtype=np.uint64)
 
 
-def read_rigs(path: Path) -> tuple[tuple[RawRig, ...], tuple[Finding, ...]]:
+def read_rigs(path: InputPath) -> tuple[tuple[RawRig, ...], tuple[Finding, ...]]:
     """Read rigs.txt (COLMAP 3.12 and newer): what it holds, and findings where it contradicts itself."""
     file = read_text(path)
     rigs: dict[int, RawRig] = {}
@@ -226,7 +226,7 @@ def _read_rig(fields: _Fields) -> RawRig:
     return RawRig(rig_id, sensors)
 
 
-def read_frames(path: Path) -> tuple[tuple[RawFrame, ...], tuple[Finding, ...]]:
+def read_frames(path: InputPath) -> tuple[tuple[RawFrame, ...], tuple[Finding, ...]]:
     """Read frames.txt (COLMAP 3.12 and newer): what it holds, and findings where it contradicts itself."""
     file = read_text(path)
     frames: dict[int, RawFrame] = {}

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from loaders.colmap import files_of
-from loaders.files import open_input
+from loaders.files import open_input, reading
+from loaders.locations import InputPath, RemotePath, parse_location
 
 
 @dataclass(frozen=True, slots=True)
 class InputFile:
-    """One file that a model was read from: its name in the model folder, its size in bytes, its SHA-256 in hex."""
+    """One file that a model was read from: its name in the model folder, its size in bytes, its SHA-256 in hex.
+
+    Of a file in an object store, the SHA-256 of the store's own name for this version of the content (its entity tag),
+    so that asking whether it changed does not mean fetching it.
+    """
 
     name: str
     num_bytes: int
@@ -27,10 +32,25 @@ def input_files(path: str | Path) -> tuple[InputFile, ...]:
     LoadError
         Where a file is missing or cannot be read.
     """
-    result = []
-    for file_path in files_of(Path(path)):
-        file, _ = open_input(file_path)
-        with file:
-            digest = hashlib.file_digest(file, "sha256")
-            result.append(InputFile(file_path.name, file.tell(), digest.hexdigest()))
-    return tuple(result)
+    return files_in(parse_location(path))
+
+
+def files_in(folder: InputPath) -> tuple[InputFile, ...]:
+    """Return the same for a location that was parsed."""
+    return tuple(_remote(path) if isinstance(path, RemotePath) else _hashed(path) for path in files_of(folder))
+
+
+def _remote(path: RemotePath) -> InputFile:
+    from loaders.remote import entity_tag  # noqa: PLC0415 - pyarrow costs what a local run need not pay
+
+    num_bytes, tag = entity_tag(path)
+    if tag is None:
+        return _hashed(path)
+    return InputFile(path.name, num_bytes, hashlib.sha256(tag.encode()).hexdigest())
+
+
+def _hashed(path: InputPath) -> InputFile:
+    file, _ = open_input(path)
+    with file, reading(path):
+        digest = hashlib.file_digest(file, "sha256")
+        return InputFile(path.name, file.tell(), digest.hexdigest())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -45,6 +45,37 @@ class FindingCode(StrEnum):
     EXACT_PROJECTIONS = "exact_projections"
     POINTS_NOT_OPTIMAL = "points_not_optimal"
     TRACK_STATISTICS_FROM_ALL_IMAGES = "track_statistics_from_all_images"
+
+
+FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
+    FindingCode.BINARY_TEXT_DISAGREE: "binary and text files lie in one folder and differ in counts; binary was read",
+    FindingCode.TRACKS_DISAGREE: "tracks and images name different observations; the images' own point ids were read",
+    FindingCode.DANGLING_POINT_IDS: "linked 2D points name a 3D point that the model does not have (num_dangling)",
+    FindingCode.UNSEEN_POINTS: "3D points to which no image links",
+    FindingCode.SHORT_TRACKS: "3D points to which a single 2D point links",
+    FindingCode.REPEATED_OBSERVATIONS: "linked 2D points that repeat a 3D point which their image has linked already",
+    FindingCode.STORED_ERRORS_ZERO: "the stored errors of all 3D points are 0: nobody computed them",
+    FindingCode.STORED_ERRORS_MISSING: "3D points without a stored error (COLMAP's -1, or no number)",
+    FindingCode.STORED_ERRORS_STALE: "stored point errors that the model does not have (more than 1 % of the points)",
+    FindingCode.ORPHAN_CAMERAS: "cameras that belong to no image",
+    FindingCode.MISSING_CAMERAS: "images whose camera does not exist; they are undetermined",
+    FindingCode.NON_UNIT_QUATERNIONS: "rotation quaternions of a length other than 1; not normalised, as in COLMAP",
+    FindingCode.NON_FINITE_POSES: "images whose pose is not finite; they are undetermined",
+    FindingCode.NON_FINITE_POINTS: "3D points that are not finite; their projections count as num_nonfinite",
+    FindingCode.NON_FINITE_CAMERAS: "cameras with parameters that are not finite; their images are undetermined",
+    FindingCode.NON_FINITE_OBSERVATIONS: "linked 2D points that are not finite",
+    FindingCode.OBSERVATIONS_OUTSIDE: "linked 2D points outside of their image",
+    FindingCode.IMAGE_SIZE_SWAPPED: "cameras whose principal point says that width and height are swapped",
+    FindingCode.DUPLICATE_NAMES: "images that share their name with another one",
+    FindingCode.INCOMPLETE_RIGS: "rigs and frames do not place all images, or one of their files is missing",
+    FindingCode.EMPTY_MODEL: "the model has no images, or no 3D points",
+    FindingCode.STATED_COUNT_DIFFERS: "a text file says in its head that it holds another number of records",
+    FindingCode.UNTERMINATED_TEXT: "a text file does not end its last line: its last number may be cut",
+    FindingCode.EXACT_PROJECTIONS: "images whose 2D points are projections of the 3D points, not measurements",
+    FindingCode.POINTS_NOT_OPTIMAL: "moving the 3D points alone would remove much of the residuals (removable_share)",
+    FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES: "too many images are away from their optimum to leave them out",
+}
+"""One line per finding, for docs/findings.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +255,7 @@ class SparseModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InlierSet:
-    """The 2D-3D inliers of one image (METHOD.md section 1); row i of every array is the same observation.
+    """The 2D-3D inliers of one image (method.md section 1); row i of every array is the same observation.
 
     xy_px: (n, 2) float64, observed, distorted; first pixel centre = (0.5, 0.5).
     xyz_world: (n, 3) float64, model units.      point_idx: (n,) int64, rows of SparseModel.points.

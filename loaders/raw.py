@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 
 from loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
 from loaders.errors import MalformedFileError, Position
+from loaders.locations import InputPath
 from loaders.model import CameraTable, Finding
 
 UNLINKED: Final = np.uint64(2**64 - 1)
@@ -152,7 +152,7 @@ def offsets_of(lengths: Sequence[int] | IntArray) -> IntArray:
     return offsets
 
 
-def order_of_points(path: Path, point3d_id: UInt64Array, position: Callable[[int], Position]) -> IntArray:
+def order_of_points(path: InputPath, point3d_id: UInt64Array, position: Callable[[int], Position]) -> IntArray:
     """Return the permutation that sorts ``point3d_id``.
 
     Raises
@@ -171,13 +171,13 @@ def order_of_points(path: Path, point3d_id: UInt64Array, position: Callable[[int
     return order
 
 
-def duplicate_id(path: Path, position: Position, kind: str, item_id: int) -> MalformedFileError:
+def duplicate_id(path: InputPath, position: Position, kind: str, item_id: int) -> MalformedFileError:
     """Return the error for an id that the file has used before."""
     wanted = f"a {kind} id that the file has not used before"
     return MalformedFileError(str(path), position, wanted, f"id {item_id} again", "export the reconstruction again")
 
 
-def check_camera(path: Path, position: Position, camera: RawCamera) -> None:
+def check_camera(path: InputPath, position: Position, camera: RawCamera) -> None:
     """Raise MalformedFileError where the size of ``camera`` does not fit the 32 bits that the tables give it."""
     if max(camera.width, camera.height) >= 2**32:
         got = f"{camera.width} x {camera.height}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from loaders.arrays import FloatArray
 from loaders.errors import MalformedFileError, Position, TruncatedFileError
 from loaders.files import read_bytes
+from loaders.locations import InputPath
 from loaders.model import Finding, FindingCode
 
 _STATED_COUNT: Final = re.compile(rb"#\s*Number of (?:cameras|images|points|rigs|frames)\s*:\s*(\d{1,18})(?!\d)")
@@ -26,7 +26,7 @@ _RECOPY: Final = "copy or export the reconstruction again"
 class TextFile:
     """The lines of one file; ``stated_count`` is what its comment "# Number of ...: N" says, None without one."""
 
-    path: Path
+    path: InputPath
     lines: list[bytes]
     stated_count: int | None
     is_terminated: bool
@@ -47,7 +47,7 @@ class TextFile:
         return TruncatedFileError(str(self.path), Position("line", len(self.lines)), wanted, got, _RECOPY)
 
 
-def read_text(path: Path) -> TextFile:
+def read_text(path: InputPath) -> TextFile:
     """Read a text file; errors as of `loaders.files.open_input`, and MalformedFileError where it is no text."""
     data = read_bytes(path).removeprefix(_BYTE_ORDER_MARK)
     nul = data.find(b"\0")

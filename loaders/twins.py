@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 from loaders.errors import LoadError
 from loaders.files import exists
+from loaders.locations import InputPath
 from loaders.model import Finding, FindingCode
 from loaders.raw import RawModel
 from loaders.text_lines import read_text
@@ -14,7 +14,7 @@ from loaders.text_lines import read_text
 _NAMES: Final = ("cameras", "images", "points3D")
 
 
-def compare_with_text(folder: Path, raw: RawModel) -> tuple[Finding, ...]:
+def compare_with_text(folder: InputPath, raw: RawModel) -> tuple[Finding, ...]:
     """Return a finding where the text files beside the binary ones hold other numbers of records."""
     counts = {"cameras": len(raw.cameras), "images": len(raw.images.image_id), "points3D": len(raw.points.order)}
     differences = []
@@ -35,7 +35,7 @@ def compare_with_text(folder: Path, raw: RawModel) -> tuple[Finding, ...]:
     return (Finding(FindingCode.BINARY_TEXT_DISAGREE, len(differences), text),)
 
 
-def mention_ignored_binary(folder: Path) -> tuple[Finding, ...]:
+def mention_ignored_binary(folder: InputPath) -> tuple[Finding, ...]:
     """Return a finding where binary files lie beside the text files that were read because they are not complete."""
     there = [f"{name}.bin" for name in _NAMES if exists(folder / f"{name}.bin")]
     if not there:
@@ -44,7 +44,7 @@ def mention_ignored_binary(folder: Path) -> tuple[Finding, ...]:
     return (Finding(FindingCode.BINARY_TEXT_DISAGREE, len(there), text),)
 
 
-def count_records(path: Path) -> int:
+def count_records(path: InputPath) -> int:
     """Return how many cameras, images or points a text file holds, without parsing them.
 
     Raises

@@ -59,7 +59,7 @@ def project(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> Floa
 
     Notes
     -----
-    METHOD.md section 1 asks of an inlier that Zc > 0 *and* a finite projection. The first is the caller's question:
+    method.md section 1 asks of an inlier that Zc > 0 *and* a finite projection. The first is the caller's question:
     a division model with k < 0 has finite projections of points behind the camera.
 
     Source: COLMAP 4.2, src/colmap/sensor/models.h.
@@ -92,7 +92,7 @@ def project_with_jacobians(
 
 
 def normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
-    """Return the undistorted normalised point, METHOD.md section 5's u.
+    """Return the undistorted normalised point, method.md section 5's u.
 
     Parameters as in ``project``; ``params`` do not matter and are there so that the three functions look alike.
 
@@ -113,7 +113,7 @@ def normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> F
 
 
 def distorted_normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
-    """Return ((x - cx) / fx, (y - cy) / fy) of the projected points, METHOD.md section 5's v.
+    """Return ((x - cx) / fx, (y - cy) / fy) of the projected points, method.md section 5's v.
 
     Parameters as in ``project``. (n, 2), NaN where ``project`` is NaN, and everywhere for spherical models.
     """

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
-
-from tqdm import tqdm
 
 from audit.cli.errors import ExitCode, KnownError
+from audit.cli.finding import Wanted, find_models
+from audit.cli.progress import Progress
 from audit.config import AuditConfig
 from audit.runner import audit_many
-from loaders import Discovery, ModelRef, discover
-from loaders.input_state import input_size
+from audit.schedule.errors import ClusterError
+from audit.schedule.processes import BYTES_WORTH_A_PROCESS
+from loaders import Discovery
 from reports.drawing import Page
 from reports.errors import OutputError, RunFolderError
 from reports.reader import RunReader
@@ -26,18 +27,26 @@ from reports.store import RunSettings, RunStore
 from reports.summary import render_summary
 from reports.wording import plain
 
-_BYTES_WORTH_A_PROCESS: Final = 50_000_000  # of input: about a second of work, which is what a process costs
-
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What a user asks for. jobs: number of processes, None for as many as there are CPUs and work for them."""
+    """What a user asks for.
+
+    jobs: number of processes, None for as many as there are CPUs and work for them.
+    observations: whether to write a row per inlier too.
+    dask: address of a Dask scheduler, or "local"; None without Dask.
+    wanted: which models below the PATHs.    max_model_bytes: a larger one is not loaded; None for no limit.
+    """
 
     paths: Sequence[str]
     folder: Path
     config: AuditConfig
     jobs: int | None = None
     quiet: bool = False
+    observations: bool = False
+    dask: str | None = None
+    wanted: Wanted = field(default_factory=Wanted)
+    max_model_bytes: int | None = None
 
 
 def run_audit(request: RunRequest) -> ExitCode:
@@ -46,15 +55,17 @@ def run_audit(request: RunRequest) -> ExitCode:
     Raises
     ------
     KnownError
-        The run folder cannot be used or written.
+        The run folder cannot be used or written, or the Dask cluster cannot be used.
     """
+    if request.dask is not None and importlib.util.find_spec("distributed") is None:
+        raise KnownError("--dask needs the extra cluster: pip install 'sfm-audit[cluster]'", ExitCode.USAGE)
     start = time.perf_counter()
-    found = discover(request.paths)
+    found = find_models(request.paths, request.wanted)
     problems = [(error.path, str(error)) for error in found.errors]
     if found.refs:
         try:
             problems += _write_run(request, found, start)
-        except RunFolderError as error:
+        except (RunFolderError, ClusterError) as error:
             raise KnownError(str(error), ExitCode.USAGE) from error
         except OutputError as error:
             raise KnownError(str(error), ExitCode.OUTPUT) from error
@@ -93,19 +104,22 @@ def _write_run(request: RunRequest, found: Discovery, start: float) -> list[tupl
         request.config.model_dump(),
         list(request.paths),
         _paths_without_models(request.paths, found),
+        request.observations,
     )
     silent = request.quiet or not sys.stderr.isatty()
-    with RunStore(request.folder, settings) as store, tqdm(total=len(found.refs), unit="model", disable=silent) as bar:
-
-        def advance(_: ModelRef) -> None:
-            bar.update()
-
+    store = RunStore(request.folder, settings)
+    store.refuse_to_forget(found.left_out)
+    with store, Progress(found.refs, silent=silent) as progress:
         failures = audit_many(
             found.refs,
             request.config,
             jobs=request.jobs or _sensible_jobs(found),
             sink=store,
-            on_done=advance,
+            on_done=progress.advance,
+            on_skip=progress.skip,
+            observations=request.observations,
+            dask=request.dask,
+            max_model_bytes=request.max_model_bytes,
         )
         own = [(failure.location, failure.message) for failure in failures]
         # a PATH that is not there today, such as a disk that is not mounted, does not cost the tables made from it
@@ -122,5 +136,5 @@ def _paths_without_models(paths: Sequence[str], found: Discovery) -> frozenset[s
 def _sensible_jobs(found: Discovery) -> int:
     """Return one process per CPU, fewer where starting them costs more than they save."""
     num_cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    num_bytes = sum(input_size(ref.location) for ref in found.refs)
-    return max(1, min(num_cpus, num_bytes // _BYTES_WORTH_A_PROCESS))
+    num_bytes = sum(ref.num_bytes for ref in found.refs)
+    return max(1, min(num_cpus, num_bytes // BYTES_WORTH_A_PROCESS))

@@ -13,6 +13,12 @@ from audit.cli.errors import ExitCode, KnownError
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
+    "report": "Write one HTML page about a run, to look at and to send.",
+    "explain": "Tell one image's whole story, as text and pictures.",
+    "check": "Pass or fail a run by a gate file, for nightly builds.",
+    "learn-band": "Learn what repeated reconstructions differ by, as a gate file.",
+    "diff": "Show what changed between two runs.",
+    "filter": "Write lists, models and benchmark files without the rejected images.",
     "demo": "Audit simulated photos with planted defects; needs no data.",
 }
 
@@ -30,7 +36,7 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in VERBS:
             return None
-        return cast("click.Command", importlib.import_module(f"audit.cli.{cmd_name}").command)
+        return cast("click.Command", importlib.import_module(f"audit.cli.{cmd_name.replace('-', '_')}").command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""

@@ -9,11 +9,9 @@ import click
 
 from audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
 from audit.cli.errors import ExitCode
+from audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
 from audit.cli.settings import read_config
-from audit.config import AuditConfig, NoiseName, PolicyName
-from loaders import discover
-from loaders.input_state import input_size
-from reports.wording import plain
+from audit.config import AuditConfig, NoiseName, PointsName, PolicyName
 
 _DEFAULTS = AuditConfig()
 
@@ -24,12 +22,27 @@ _DEFAULTS = AuditConfig()
 @click.option(
     "--jobs",
     type=click.IntRange(min=1),
-    help="Processes, each with one model at a time.  [default: CPUs, fewer for little input]",
+    help="Processes; a large model is spread over several.  [default: CPUs, fewer for little input]",
+)
+@click.option(
+    "--dask",
+    metavar="ADDRESS|local",
+    help="Audit on the workers of this Dask scheduler (tcp://HOST:PORT), or of one on this machine.",
 )
 @click.option(
     "--noise",
     type=click.Choice(get_args(NoiseName)),
     help=f"Noise model behind the tests.  [default: {_DEFAULTS.noise}]",
+)
+@click.option(
+    "--points",
+    type=click.Choice(get_args(PointsName)),
+    help=f"Were the 3D points triangulated from these images?  [default: {_DEFAULTS.points}]",
+)
+@click.option(
+    "--min-effect",
+    metavar="TAU",
+    help=f"Misfit that matters, such as 0.2px or 0.5sigma.  [default: {_DEFAULTS.min_effect}]",
 )
 @click.option(
     "--policy",
@@ -43,6 +56,14 @@ _DEFAULTS = AuditConfig()
     type=click.Path(path_type=Path),
     help="Settings by name (docs/config.md); options of the command line come before them.",
 )
+@with_choice_of_models
+@click.option(
+    "--max-model-gb",
+    metavar="GB",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Refuse to load a model whose files are larger.  [default: no limit]",
+)
+@click.option("--observations", is_flag=True, help="Write RUN/observations too, one row per inlier.")
 @click.option("--list", "only_list", is_flag=True, help="Print the models that were found, audit nothing.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary; errors are still said.")
 def command(  # one parameter per option
@@ -57,24 +78,29 @@ def command(  # one parameter per option
     Exit codes: 0 fine; 2 wrong usage or config, or RUN is in use or holds another run; 3 some input could not be read
     (the rest was audited and written); 4 RUN could not be written.
     """
-    config = read_config(config_file, {name: options[name] for name in ("noise", "policy")})
+    config = read_config(config_file, {name: options[name] for name in ("noise", "points", "min_effect", "policy")})
+    wanted = wanted_of(**{name: options[name] for name in ("layout", "scenes", "components", "scene_lists")})
     if options["only_list"]:
-        return _list(paths)
+        lines, problems = listed(find_models(paths, wanted))
+        print_page("\n".join(lines))
+        for problem in problems:
+            click.echo(f"sfm-audit: {problem}", err=True)
+        return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
     if out is None:
         raise click.UsageError("Missing option '-o': the folder for the tables.")
-    exit_code = run_audit(RunRequest(paths, out, config, options["jobs"], options["quiet"]))
+    limit_gb = options["max_model_gb"]
+    request = RunRequest(
+        paths,
+        out,
+        config,
+        options["jobs"],
+        options["quiet"],
+        options["observations"],
+        options["dask"],
+        wanted,
+        None if limit_gb is None else int(limit_gb * 1e9),
+    )
+    exit_code = run_audit(request)
     if not options["quiet"] and (out / "run.json").exists():
         print_summary(out)
     return exit_code
-
-
-def _list(paths: tuple[str, ...]) -> ExitCode:
-    """Print dataset, scene, component, size in bytes, and location, separated by tabs."""
-    found = discover(paths)
-    rows = [
-        (ref.dataset, ref.scene, ref.component, str(input_size(ref.location)), ref.model_path) for ref in found.refs
-    ]
-    print_page("\n".join("\t".join(plain(cell) for cell in row) for row in rows))
-    for error in found.errors:
-        click.echo(f"sfm-audit: {plain(str(error))}", err=True)
-    return ExitCode.UNREADABLE_INPUT if found.errors else ExitCode.OK

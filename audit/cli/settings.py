@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from audit.cli.errors import ExitCode, KnownError
 from audit.config import AuditConfig
+
+_CROSS_FIELD: Final = "value_error"  # a rule about several settings, each of which is valid by itself
+_PATTERNS: Final = {"min_effect": "a number with its unit, such as 0.2px or 0.5sigma"}
 
 
 def read_config(file: Path | None, options: Mapping[str, Any]) -> AuditConfig:
@@ -24,10 +28,20 @@ def read_config(file: Path | None, options: Mapping[str, Any]) -> AuditConfig:
     Raises
     ------
     KnownError
-        The file cannot be read, has an unknown key, or a value of the wrong kind.
+        The file cannot be read, has an unknown key, or a value of the wrong kind; an option has a value of the wrong
+        kind; or settings contradict each other. The message names the file or the option.
     """
-    from_file = {} if file is None else _checked(_read_toml(file), file)
-    return AuditConfig.model_validate({**from_file, **{k: v for k, v in options.items() if v is not None}})
+    said = {name: value for name, value in options.items() if value is not None}
+    from_file = {} if file is None else _read_toml(file)
+    if file is not None:
+        _refuse_wrong_values(from_file, lambda name: f"{file}: {name}")
+    _refuse_wrong_values(said, _option)
+    try:
+        return AuditConfig.model_validate({**from_file, **said})
+    except ValidationError as error:
+        sources = [*([str(file)] if from_file else []), *(_option(name) for name in said)]
+        problem = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise KnownError(f"{', '.join(sources)}: {problem}", ExitCode.USAGE) from error
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
@@ -39,16 +53,29 @@ def _read_toml(file: Path) -> dict[str, Any]:
         raise KnownError(f"{file}: not a TOML file: {error}", ExitCode.USAGE) from error
 
 
-def _checked(content: dict[str, Any], file: Path) -> dict[str, Any]:
+def _refuse_wrong_values(content: Mapping[str, Any], place: Callable[[str], str]) -> None:
+    """Refuse unknown settings and values of the wrong kind; ``place`` says where a setting was made.
+
+    Settings that contradict each other are no matter of one place: the file may be completed by the command line.
+    """
     try:
         AuditConfig.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            problem = f"unknown setting {key}; expected one of {', '.join(AuditConfig.model_fields)}"
-        else:
-            wanted = first["msg"].removeprefix("Input should be ")
-            problem = f"{key}: expected {wanted}, found {first['input']!r}"
-        raise KnownError(f"{file}: {problem}", ExitCode.USAGE) from error
-    return content
+        wrong = [detail for detail in error.errors() if detail["type"] != _CROSS_FIELD]
+        if wrong:
+            raise KnownError(_problem(wrong[0], place), ExitCode.USAGE) from error
+
+
+def _problem(detail: ErrorDetails, place: Callable[[str], str]) -> str:
+    name = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        where = place(name).removesuffix(name)
+        return f"{where}unknown setting {name}; expected one of {', '.join(AuditConfig.model_fields)}"
+    wanted = detail["msg"].removeprefix("Input should be ")
+    if detail["type"] == "string_pattern_mismatch":
+        wanted = _PATTERNS[name]
+    return f"{place(name)}: expected {wanted}, found {detail['input']!r}"
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"

@@ -1,4 +1,4 @@
-"""Goodness of fit of standardised residuals to N(0, 1): METHOD.md section 4.
+"""Goodness of fit of standardised residuals to N(0, 1): method.md section 4.
 
 In pytest modules write ``from audit import normality``: an imported name ``normality_tests`` would be collected.
 """
@@ -20,8 +20,8 @@ __all__ = [
     "ks_fitted",
     "ks_norm",
     "ks_norm_unscaled",
+    "normality_tests",
     "sample_shape",
     "shapiro_wilk",
-    "normality_tests",
     "thin_observations",
 ]

@@ -1,4 +1,4 @@
-"""Are the standardised residuals of one image a sample of N(0, 1)? METHOD.md section 4."""
+"""Are the standardised residuals of one image a sample of N(0, 1)? method.md section 4."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from loaders.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class NormalityTests:
-    """All of METHOD.md section 4 for one image; NaN where a test could not run.
+    """All of method.md section 4 for one image; NaN where a test could not run.
 
     num_values: N = 2n, x and y pooled.    ks_*_stat: Kolmogorov's D (not modified), the effect size, 0..1.
     dap_stat: K^2.    sw_stat: W.    sw_num_values: how many values Shapiro-Wilk used, at most 5000.

@@ -154,7 +154,7 @@ def systematic_rms_px(
 
     Notes
     -----
-    Gauss-Newton on pose (left perturbation) and intrinsics; METHOD.md section 5's nuisance columns N, iterated.
+    Gauss-Newton on pose (left perturbation) and intrinsics; method.md section 5's nuisance columns N, iterated.
     """
     free = [j for j in range(claimed.num_params) if j not in claimed.principal_point_idxs]
     params = params.copy()

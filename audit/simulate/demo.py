@@ -16,7 +16,7 @@ _POINTS_PER_IMAGE: Final = 350
 _RADIAL_PX: Final = (0.3, 0.6, 1.0)
 _POSE_PX: Final = (1.5, 3.0)
 _CORNERS: Final = ((22.0, 0.0), (18.0, 3.0))
-_NOISE: Final = NoiseSpec(NoiseKind.PER_TRACK_LOGNORMAL, sigma_px=0.5, log_spread=0.75)
+_NOISE: Final = NoiseSpec(NoiseKind.PER_TRACK_LOGNORMAL, sigma_px=0.5, log_spread=0.7)
 
 
 @dataclass(frozen=True, slots=True)

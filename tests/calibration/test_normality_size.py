@@ -85,7 +85,7 @@ def test_power_on_planted_departures(make, powerful):
 
 
 def test_blind_to_the_arrangement():
-    """Sorted by size, the same residuals are as normal as before: METHOD.md section 5 is for that."""
+    """Sorted by size, the same residuals are as normal as before: method.md section 5 is for that."""
     z = gaussian(np.random.default_rng(14), 200)
     arranged = z[np.argsort(z[:, 0])]
     expected, found = normality.normality_tests(z), normality.normality_tests(arranged)

@@ -77,7 +77,7 @@ def test_binary_and_text_twins_give_the_same_tables(corpus, binary, text):
 
 @pytest.mark.corpus
 def test_track_noise_explains_what_constant_noise_does_not(corpus):
-    """METHOD.md 3b on real models: plain KS rejects most images under constant noise, few under track noise."""
+    """method.md 3b on real models: plain KS rejects most images under constant noise, few under track noise."""
     shares = []
     for name in ("bartoszek_sparse", "hsu_fox_bin", "pratikk_sfm_7", "halogen_sparse", "terteros_bin"):
         images = audit_model(open_model(corpus / "models" / name), AuditConfig()).images.to_pandas()

@@ -34,12 +34,16 @@ def test_defaults_then_file_then_command_line(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("alhpa = 0.1", "unknown setting alhpa; expected one of noise, policy, alpha"),
+        ("alhpa = 0.1", "unknown setting alhpa; expected one of noise, points, policy, min_effect, alpha"),
         ('alpha = "small"', "alpha: expected a valid number, found 'small'"),
         ("alpha = 1.5", "alpha: expected less than 1, found 1.5"),
         ("min_observations = 20.5", "min_observations: expected a valid integer, found 20.5"),
         ("min_observations = true", "min_observations: expected a valid integer, found True"),
-        ('noise = "loud"', "noise: expected 'track' or 'constant', found 'loud'"),
+        ('noise = "loud"', "noise: expected 'track', 'constant' or 'keypoint', found 'loud'"),
+        ('points = "both"', "points: expected 'in-sample' or 'independent', found 'both'"),
+        ('min_effect = "0.2"', "min_effect: expected a number with its unit, such as 0.2px or 0.5sigma, found '0.2'"),
+        ("min_effect = 0.2", "min_effect: expected a valid string, found 0.2"),
+        ('points = "independent"', "points = independent takes noise = constant, not track"),
         ("[audit]\nalpha = 0.1", "unknown setting audit"),
         ("alpha = ", "not a TOML file"),
     ],
@@ -52,6 +56,43 @@ def test_a_wrong_file_is_one_line_that_names_file_and_key(tmp_path, text, words)
     assert str(caught.value).startswith(f"{file}: ")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"min_effect": "nonsense"},
+            "--min-effect: expected a number with its unit, such as 0.2px or 0.5sigma, found 'nonsense'",
+        ),
+        ({"noise": "loud"}, "--noise: expected 'track', 'constant' or 'keypoint', found 'loud'"),
+        ({"points": "independent"}, "--points: points = independent takes noise = constant, not track"),
+        (
+            {"points": "independent", "noise": "keypoint"},
+            "--points, --noise: points = independent takes noise = constant, not keypoint",
+        ),
+    ],
+)
+def test_wrong_options_are_one_line_that_names_the_option(options, message):
+    with pytest.raises(KnownError) as caught:
+        read_config(None, {"policy": None, **options})
+    assert caught.value.exit_code == ExitCode.USAGE
+    assert str(caught.value) == message
+
+
+def test_the_command_line_may_complete_a_file_and_contradict_it(tmp_path):
+    file = write(tmp_path, 'points = "independent"\n')
+    assert read_config(file, {"noise": "constant"}).points == "independent"
+    with pytest.raises(KnownError) as caught:
+        read_config(file, {"noise": "track"})
+    assert str(caught.value) == f"{file}, --noise: points = independent takes noise = constant, not track"
+
+
+@pytest.mark.parametrize(
+    ("text", "sigma_px", "tau_px"), [("0.2px", 0.5, 0.2), (".3px", 9.0, 0.3), ("0.5sigma", 0.1, 0.05)]
+)
+def test_min_effect_is_px_or_the_image_s_sigma(text, sigma_px, tau_px):
+    assert AuditConfig(min_effect=text).tau_px(sigma_px) == pytest.approx(tau_px, rel=1e-12)
 
 
 def test_a_missing_file_and_one_that_is_no_text_are_said_so(tmp_path):

@@ -84,7 +84,8 @@ def test_exact_projections_are_no_measurements(model):
     result = audit_model(exact)
     rows = result.images.to_pylist()
     assert {row["verdict"] for row in rows} == {"undetermined"}
-    assert reasons(rows[0]) == ["exact_projections"]
+    assert reasons(rows[0])[0] == "exact_projections"
+    assert {rows[0][name] for name in ("verdict_ks", "verdict_misfit")} == {"undetermined"}
     assert FindingCode.EXACT_PROJECTIONS in [f["code"] for f in result.models.to_pylist()[0]["findings"]]
 
 

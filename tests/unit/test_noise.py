@@ -1,4 +1,4 @@
-"""Robust variance fits: the estimating equation, METHOD.md's iteration as written, and known answers."""
+"""Robust variance fits: the estimating equation, method.md's iteration as written, and known answers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from audit.noise import CONSISTENCY, CUTOFF, fit_constant_variance, fit_variance
 
 
 def as_written(y, predictor, iterations=3000):
-    """METHOD.md section 2, literally: start (median / 0.4549, 0), scoring steps until no s_j moves by 1e-8."""
+    """method.md section 2, literally: start (median / 0.4549, 0), scoring steps until no s_j moves by 1e-8."""
     theta = np.array([np.median(y) / 0.4549, 0.0])
     for _ in range(iterations):
         previous, theta = theta, scoring_step(y, predictor, theta)

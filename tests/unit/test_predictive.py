@@ -66,7 +66,7 @@ def test_prior_is_the_maximum_that_a_general_optimiser_finds():
     e, other, dof = simulate(np.random.default_rng(6), 500, 3.0, 0.5)
     sq = (e**2).sum(axis=0)
 
-    def minus_log_likelihood(x):  # METHOD.md (4), written as there
+    def minus_log_likelihood(x):  # method.md (4), written as there
         nu0, s0_sq = np.exp(x)
         nu = nu0 + dof
         scale_sq = (nu0 * s0_sq + other) / nu

@@ -50,7 +50,7 @@ def test_processes_give_the_tables_of_one_process(refs):
     assert run(refs, two, jobs=2) == []
     assert one.tables.keys() == two.tables.keys() == {ref.key for ref in refs}
     for key, tables in one.tables.items():
-        assert all(tables[name].equals(two.tables[key][name]) for name in ("images", "models"))
+        assert all(tables[name].equals(two.tables[key][name]) for name in ("images", "cameras", "models"))
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -95,10 +95,10 @@ def test_an_error_nobody_expects_is_raised(refs, jobs):
 
 
 def test_a_bug_says_which_model_it_met(refs, monkeypatch):
-    def broken(*_: object):
+    def broken(*_: object, **__: object):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("audit.runner.audit_model", broken)
+    monkeypatch.setattr("audit.schedule.task.audit_model", broken)
     with pytest.raises(ZeroDivisionError) as caught:
         run(refs, Memory())
     assert caught.value.__notes__ == [f"while auditing {refs[0].model_path}"]

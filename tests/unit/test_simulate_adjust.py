@@ -84,7 +84,7 @@ def test_residuals_shrink_by_the_degrees_of_freedom(scene, claim):
     num_values, num_params = residuals.size, 3 * len(scene.xyz_world) + 8 * 20 - 7
     expected = 0.5 * np.sqrt(1 - num_params / num_values)
     assert np.sqrt((residuals**2).mean()) == pytest.approx(expected, rel=0.02)
-    shrinkage = np.sqrt(1 - 1.5 / np.bincount(scene.point_idx).mean() - 8 / (2 * 300))  # METHOD.md 3a
+    shrinkage = np.sqrt(1 - 1.5 / np.bincount(scene.point_idx).mean() - 8 / (2 * 300))  # method.md 3a
     assert np.sqrt((residuals**2).mean()) == pytest.approx(0.5 * shrinkage, rel=0.02)
     raw = np.sqrt(((scene.xy_px - scene.xy_true_px) ** 2).mean())
     assert raw == pytest.approx(0.5, rel=0.02)

@@ -34,8 +34,8 @@ def run_json(folder: Path) -> dict:
 def test_a_run_folder_holds_what_design_says(tmp_path):
     run = tmp_path / "new" / "RUN"
     write_run(run)
-    assert sorted(path.name for path in (run / "images").iterdir()) == sorted(f"part-{r.key}.parquet" for r in (A, B))
-    assert sorted(path.name for path in (run / "models").iterdir()) == sorted(f"part-{r.key}.parquet" for r in (A, B))
+    for table in ("images", "cameras", "models"):
+        assert sorted(path.name for path in (run / table).iterdir()) == sorted(f"part-{r.key}.parquet" for r in (A, B))
     info = run_json(run)
     assert (info["tool"], info["version"], info["status"]) == ("sfm-audit", "0.1.0", "complete")
     assert info["config"]["noise"] == "track"
@@ -61,6 +61,7 @@ def test_pandas_reads_all_parts_of_a_table_at_once(tmp_path):
     assert set(frame["scene"]) == {"a", "b"}
     assert frame["image_id"].dtype == "uint32"
     assert list(pd.read_parquet(f"{tmp_path}/models")["num_images"]) == [2, 2]
+    assert list(pd.read_parquet(f"{tmp_path}/cameras")["num_images"]) == [2, 2]
 
 
 def test_the_reader_streams_the_rows_of_all_parts(tmp_path):
@@ -85,10 +86,11 @@ def test_finished_models_are_known_with_their_input(tmp_path):
     "change",
     [
         lambda run: (run / "images" / f"part-{A.key}.parquet").unlink(),
+        lambda run: (run / "cameras" / f"part-{A.key}.parquet").unlink(),
         lambda run: (run / "models" / f"part-{A.key}.parquet").unlink(),
         lambda run: (run / "models" / f"part-{A.key}.parquet").write_bytes(b"PAR1 cut"),
     ],
-    ids=["no images", "no models", "broken"],
+    ids=["no images", "no cameras", "no models", "broken"],
 )
 def test_a_model_with_parts_missing_or_broken_is_not_finished(tmp_path, change):
     write_run(tmp_path, [A])
@@ -128,7 +130,7 @@ def test_the_models_part_which_says_finished_is_written_last(tmp_path, monkeypat
     with RunStore(tmp_path, settings()) as store:
         written.clear()
         store.write(A, STATE, sample_tables(A), 0.1)
-    assert written == ["images", "models"]
+    assert written == ["images", "cameras", "models"]
 
 
 def test_a_full_disk_is_one_line_and_leaves_finished_parts_and_no_other_files(tmp_path, monkeypatch):
@@ -177,7 +179,7 @@ def test_a_path_whose_models_are_gone_today_stays_bound(tmp_path):
     with RunStore(tmp_path, unmounted) as store:
         store.finish(None, [("b", "b: nothing there")], 1.0)
     assert [path["given"] for path in run_json(tmp_path)["paths"]] == ["a", "b"]
-    assert len(part_times(tmp_path)) == 4
+    assert len(part_times(tmp_path)) == 6
 
 
 def test_models_that_are_no_longer_there_are_removed_at_the_end(tmp_path):
@@ -185,7 +187,7 @@ def test_models_that_are_no_longer_there_are_removed_at_the_end(tmp_path):
     with RunStore(tmp_path, settings()) as store:
         assert store.finished(A)
         store.finish([A.key], [], 1.0)
-    assert set(part_times(tmp_path)) == {f"{name}/part-{A.key}.parquet" for name in ("images", "models")}
+    assert set(part_times(tmp_path)) == {f"{name}/part-{A.key}.parquet" for name in ("images", "cameras", "models")}
     assert run_json(tmp_path)["counts"]["num_models"] == 1
 
 

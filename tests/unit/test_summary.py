@@ -8,9 +8,11 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from run_samples import STATE, make_ref, sample_tables, settings
 
+from audit.verdict import ReasonCode, Verdict
 from loaders.model import Finding, FindingCode
 from reports.drawing import Page
 from reports.reader import RunReader
+from reports.reasons import is_remark
 from reports.store import RunStore
 from reports.summary import CAVEATS, MAX_IMAGES_OF_ONE, MAX_MODELS, render_summary
 from reports.wording import natural_key, number, plain, probability, px, shorten
@@ -61,7 +63,7 @@ def test_every_line_fits_the_page(run_folder, models, images, page):
     text = render_summary(make_run(run_folder, models, images, name), page)
     assert max(cell_len(line) for line in text.splitlines()) <= page.width
     assert "ac-" in text
-    assert "KS" in text
+    assert "misfit" in text
 
 
 def test_names_are_text_on_their_line(run_folder):
@@ -97,6 +99,125 @@ def test_one_model_shows_its_images_rejected_first(run_folder):
     assert f"... and {60 - MAX_IMAGES_OF_ONE} more, see {run_folder}/images" in text
 
 
+def section(text: str, title: str) -> str:
+    """The lines from a title to the next empty line."""
+    return text[text.index(title) :].split("\n\n", 1)[0]
+
+
+def image_lines(text: str) -> list[list[str]]:
+    return [line.split() for line in text.splitlines() if line.startswith("IMG_")]
+
+
+def one_model(folder: Path, verdicts, models=None, cameras=None, **columns: Any) -> str:
+    ref = make_ref()
+    with RunStore(folder, settings()) as store:
+        store.write(ref, STATE, sample_tables(ref, verdicts, models, cameras, **columns), 0.1)
+        store.finish(None, [], 1.0)
+    return render_summary(RunReader.open(folder), Page(80))
+
+
+def test_images_are_ordered_by_misfit_and_then_by_ks_distance(run_folder):
+    text = one_model(
+        run_folder,
+        ("accepted", "rejected", "rejected", "rejected", "rejected"),
+        misfit_group=["smooth", None, "principal_point", "rolling_shutter", None],
+        misfit_px=[9.0, np.nan, 0.42, 1.5, np.nan],
+        ks_stat=[0.9, 0.1, 0.8, 0.1, 0.3],
+    )
+    rows = image_lines(text)
+    assert [row[0] for row in rows] == [f"IMG_{i:04d}.jpg" for i in (3, 2, 4, 1, 0)]
+    assert [row[6:8] for row in rows[:2]] == [["rolling", "1.50"], ["principal", "0.42"]]
+    assert [row[6] for row in rows[2:4]] == ["-", "-"]
+
+
+def test_coverage_is_shown_where_names_have_room(run_folder):
+    assert "cover-" in one_model(run_folder / "short", ("rejected",))
+    long = one_model(run_folder / "long", ("rejected",), image_name=["a name of fifty cells" * 3])
+    assert "cover-" not in long
+    assert max(map(len, long.splitlines())) == 80
+
+
+def test_remarks_are_not_told_as_reasons(run_folder):
+    remark, untested = "k1_not_identified: 0.1, sd = 0.2", "misfit_not_tested: smooth (not enough evidence)"
+    text = one_model(
+        run_folder,
+        ("accepted", "rejected", "undetermined"),
+        verdict_misfit=["accepted", "rejected", "undetermined"],
+        reasons=[[remark, untested], ["misfit_radial: 0.42 px", untested], [untested, "low_coverage: 2 %", remark]],
+    )
+    reasons, remarks = section(text, "Why images are not accepted"), section(text, "Remarks (decide nothing)")
+    assert "misfit_radial  1 image, IMG_0001.jpg: 0.42 px" in reasons
+    assert "misfit_not_tested  1 image, IMG_0002.jpg" in reasons
+    assert "low_coverage  1 image" in reasons
+    assert "k1_not_identified" not in reasons
+    assert "k1_not_identified  2 images, such as IMG_0000.jpg: 0.1, sd = 0.2" in remarks
+    assert "misfit_not_tested  2 images, such as IMG_0000.jpg" in remarks
+
+
+@pytest.mark.parametrize("code", ReasonCode)
+@pytest.mark.parametrize("verdict", Verdict)
+def test_two_codes_can_be_remarks(code, verdict):
+    wanted = code == ReasonCode.K1_NOT_IDENTIFIED or (
+        code == ReasonCode.MISFIT_NOT_TESTED and verdict != Verdict.UNDETERMINED
+    )
+    assert is_remark(str(code), {"verdict_misfit": str(verdict)}) == wanted
+
+
+def test_an_image_counts_once_per_reason(run_folder):
+    reasons = [["too_few_observations: 9 inliers", "too_few_observations: 3 clean of 9 inliers"]]
+    text = one_model(run_folder, ("undetermined",), reasons=reasons)
+    assert "too_few_observations  1 image, IMG_0000.jpg: 9 inliers" in text
+
+
+def test_advice_is_counted_by_what_it_is_for(run_folder):
+    fixes = ["OPENCV", "OPENCV", "RADIAL", "none: rolling shutter", "FULL_OPENCV"]
+    text = one_model(
+        run_folder,
+        ("rejected",) * 5 + ("accepted",) * 2,
+        verdict_misfit=["rejected"] * 5 + ["accepted"] * 2,
+        advised_camera_model=[*fixes, "PINHOLE", None],
+    )
+    advice = " ".join(section(text, "Advised camera models").split())
+    assert (
+        "5 images with a misfit that matters: OPENCV (2), RADIAL (1), none: rolling shutter (1), others (1)" in advice
+    )
+    assert "1 image where less would do: PINHOLE (1)" in advice
+
+
+def test_only_shared_cameras_with_a_material_misfit_are_listed(run_folder):
+    text = one_model(
+        run_folder,
+        ("rejected",) * 2,
+        cameras={
+            "camera_id": [7],
+            "camera_model": ["SIMPLE_RADIAL"],
+            "misfit_group": ["radial"],
+            "misfit_px": [0.424],
+            "misfit_material": [True],
+            "advised_camera_model": ["RADIAL"],
+        },
+    )
+    said = "camera 7  SIMPLE_RADIAL, 2 images: radial 0.42 px; advice: RADIAL"
+    assert said in section(text, "Shared cameras")
+    for name, change in {"small": {"misfit_material": [False]}, "own": {"num_images": [1]}}.items():
+        assert "Shared cameras" not in one_model(run_folder / name, ("rejected",) * 2, cameras=change)
+
+
+@pytest.mark.parametrize("policy", ["full", "camera", "paper"])
+def test_every_verdict_is_counted_and_the_policy_named(run_folder, policy):
+    names = ("ks", "misfit", "pose", "plausible")
+    counts = {f"num_{v}_{m}": [10 * i + j] for i, m in enumerate(names) for j, v in enumerate(Verdict)}
+    ref = make_ref()
+    with RunStore(run_folder, settings(policy=policy)) as store:
+        store.write(ref, STATE, sample_tables(ref, ("rejected",) * 3, counts), 0.1)
+        store.finish(None, [], 1.0)
+    text = section(render_summary(RunReader.open(run_folder), Page(80)), "Verdicts")
+    rows = {line.split()[0]: line.split()[1:4] for line in text.splitlines() if line.startswith(("verdict_", "plaus"))}
+    columns = ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible")
+    assert rows == {column: [str(10 * i), str(10 * i + 1), str(10 * i + 2)] for i, column in enumerate(columns)}
+    assert f"policy {policy}" in text
+
+
 def test_many_models_show_those_with_the_largest_share_rejected(run_folder):
     text = render_summary(make_run(run_folder, MAX_MODELS + 5, 2), Page(80))
     assert f"{MAX_MODELS + 5} models; the {MAX_MODELS} with the largest share" in text
@@ -112,9 +233,10 @@ def test_findings_failures_and_next_steps_are_said(run_folder):
 
 def test_numbers_that_are_not_there_are_dashes(run_folder):
     nothing = np.full(3, np.nan)
-    run = make_run(run_folder, 1, 3, ks_p=nothing, rms_px=nothing, kurtosis_excess=nothing, pose_offset_px=nothing)
+    missing = dict.fromkeys(("ks_p", "rms_px", "misfit_px", "pose_offset_px", "coverage", "ks_stat"), nothing)
+    run = make_run(run_folder, 1, 3, **missing, misfit_group=[None] * 3)
     line = next(line for line in render_summary(run, Page(80)).splitlines() if line.startswith("IMG_"))
-    assert line.split().count("-") == 4
+    assert line.split().count("-") == 5
 
 
 def test_a_run_without_models_says_so(run_folder):

@@ -11,43 +11,56 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_samples import sample_table
 
-from audit.table import IMAGES, MODELS, TABLES, build_table, empty_table, schema
+from audit.table import CAMERAS, IMAGES, MODELS, OBSERVATIONS, TABLES, build_table, empty_table, schema
 from loaders.model import Finding, FindingCode
 
-# the contract of DESIGN, as far as this version computes it
-DESIGN_IMAGES = """
+GROUPS = ("radial", "tangential", "affine", "principal_point", "rolling_shutter", "smooth")
+MISFIT = " ".join(f"misfit_{group}_{what}" for group in GROUPS for what in ("p", "px", "rank"))
+MISFIT += " misfit_group misfit_px misfit_q advised_camera_model"
+
+# the contract of DESIGN
+DESIGN_IMAGES = f"""
 dataset scene component model_path image_id image_name camera_id camera_model width height params
 num_points2d num_linked num_inliers num_behind num_nonfinite num_dangling num_unverifiable num_standardised
 mean_track_length coverage occupied_cells rms_px mean_px median_px p95_px max_px
 noise_model sigma_constant_px sigma_d_px sigma_l sigma_predicted_px scale_ratio noise_converged
 ks_stat ks_p ks_q ks_fitted_p ks_norm_p ks_norm_unscaled_p dap_stat dap_p sw_stat sw_p skewness kurtosis_excess
-ks_constant_stat ks_constant_p kurtosis_constant pose_offset_px verdict verdict_ks reasons
+ks_constant_stat ks_constant_p kurtosis_constant {MISFIT}
+pose_offset_px sd_focal_px sd_focal_rel sd_k1 focal_over_size folds_over expected_error_px
+verdict verdict_ks verdict_misfit verdict_pose plausible reasons
+"""
+DESIGN_CAMERAS = f"""
+dataset scene component model_path camera_id camera_model num_images num_points3d {MISFIT}
 """
 DESIGN_MODELS = """
 dataset scene component model_path num_images num_points3d stored_error_px recomputed_point_error_px
 recomputed_observation_error_px num_accepted num_rejected num_undetermined
-num_accepted_ks num_rejected_ks num_undetermined_ks findings
+num_accepted_ks num_rejected_ks num_undetermined_ks num_accepted_misfit num_rejected_misfit num_undetermined_misfit
+num_accepted_pose num_rejected_pose num_undetermined_pose
+num_accepted_plausible num_rejected_plausible num_undetermined_plausible findings
 """
 TEXT = {
     *("dataset", "scene", "component", "model_path", "image_name", "camera_model", "noise_model", "file_format"),
-    *("verdict", "verdict_ks"),
+    *("verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible", "misfit_group", "advised_camera_model"),
 }
 
 
-@pytest.mark.parametrize(("name", "contract"), [("images", DESIGN_IMAGES), ("models", DESIGN_MODELS)])
+@pytest.mark.parametrize(
+    ("name", "contract"), [("images", DESIGN_IMAGES), ("cameras", DESIGN_CAMERAS), ("models", DESIGN_MODELS)]
+)
 def test_columns_are_design_s_in_design_s_order(name, contract):
     ours = [column.name for column in TABLES[name]]
     assert [column for column in ours if column in contract.split()] == contract.split()
     assert len(set(ours)) == len(ours)
 
 
-@pytest.mark.parametrize("column", [*IMAGES, *MODELS], ids=lambda column: column.name)
+@pytest.mark.parametrize("column", [*IMAGES, *CAMERAS, *MODELS], ids=lambda column: column.name)
 def test_types_are_design_s(column):
     if column.name in {"image_id", "camera_id", "width", "height"}:
         wanted = pa.uint32()
-    elif column.name.startswith("num_") or column.name == "occupied_cells":
+    elif column.name.startswith("num_") or column.name.endswith("_rank") or column.name == "occupied_cells":
         wanted = pa.int64()
-    elif column.name == "noise_converged":
+    elif column.name in {"noise_converged", "folds_over", "misfit_material"}:
         wanted = pa.bool_()
     elif column.name in TEXT:
         wanted = pa.string()
@@ -62,7 +75,7 @@ def test_types_are_design_s(column):
     assert column.type == wanted
 
 
-@pytest.mark.parametrize("column", [*IMAGES, *MODELS], ids=lambda column: column.name)
+@pytest.mark.parametrize("column", [*IMAGES, *CAMERAS, *MODELS, *OBSERVATIONS], ids=lambda column: column.name)
 def test_every_column_says_its_unit_and_meaning(column):
     assert column.unit
     assert column.meaning
@@ -140,7 +153,7 @@ def test_what_goes_in_comes_out_as_through_pyarrow(rows):
     assert ours.equals(pa.table(columns, schema=pa.schema(fields)))
 
 
-@pytest.mark.parametrize("name", ["images", "models"])
+@pytest.mark.parametrize("name", ["images", "cameras", "models"])
 def test_parquet_keeps_types_units_and_meanings(tmp_path, name):
     pq.write_table(sample_table(name, 2), tmp_path / "t.parquet")
     read = pq.ParquetFile(tmp_path / "t.parquet").read()
@@ -191,7 +204,7 @@ def test_building_writing_and_reading_parts_does_not_import_pandas():
         "import sys; sys.path[:0] = sys.argv[1:]\n"
         "from run_samples import sample_table\n"
         "import pyarrow.parquet as pq, tempfile, pathlib\n"
-        "for name in ('images', 'models'):\n"
+        "for name in ('images', 'cameras', 'models'):\n"
         "    path = pathlib.Path(tempfile.mkdtemp()) / 'x.parquet'\n"
         "    pq.write_table(sample_table(name, 2), path)\n"
         "    pq.ParquetFile(path).read().to_pylist()\n"

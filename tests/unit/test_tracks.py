@@ -1,4 +1,4 @@
-"""Whitening and leave-one-out sums against dense linear algebra, track by track (METHOD.md (2), (3))."""
+"""Whitening and leave-one-out sums against dense linear algebra, track by track (method.md (2), (3))."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from audit.noise import fit_variance
 from audit.tracks import track_statistics
 
 
@@ -121,3 +122,19 @@ def test_whitening_ignores_the_unit_of_the_world(seed, gain):
     other = track_statistics(residuals, jacobian * gain, point_idx, 4)
     assert_allclose(other.whitened_px, one.whitened_px, rtol=1e-12)
     assert (other.other_dof == one.other_dof).all()
+
+
+def test_homoscedastic_noise_is_not_explained_by_the_rest_of_the_track():
+    """(1) with a_k^2 of (3): sigma_l^2 ~ 0 under homoscedastic noise; the naive mean gives 0.2 and more."""
+    rng = np.random.default_rng(5)
+    length, num_points = 4, 20_000
+    jacobian, noise, point_idx = random_tracks(rng, [length] * num_points)
+    found = track_statistics(noise, jacobian, point_idx, num_points)
+    sq = (found.whitened_px**2).sum(axis=0)
+    used = found.verified & (np.bincount(point_idx[found.verified], minlength=num_points)[point_idx] == length)
+    total = np.bincount(point_idx[used], weights=sq[used], minlength=num_points)
+    exact = found.other_sq_px2[used] / found.other_dof[used]
+    naive = (total[point_idx[used]] - sq[used]) / (2 * (length - 1))
+    y = found.whitened_px[:, used] ** 2
+    assert fit_variance(y, np.minimum(exact, np.percentile(exact, 99))).structure < 0.02
+    assert fit_variance(y, np.minimum(naive, np.percentile(naive, 99))).structure > 0.2

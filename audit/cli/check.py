@@ -1,0 +1,114 @@
+"""``sfm-audit check``: judge a run by a gate file, for a nightly build."""
+
+from __future__ import annotations
+
+import datetime as dt
+import importlib.metadata
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from audit.cli.auditing import print_page, terminal_page
+from audit.cli.errors import ExitCode, KnownError
+from audit.cli.gate_file import read_gate_file
+from audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
+from reports.comparison import compare
+from reports.comparison_page import OTHER_NAMES, render_gate
+from reports.gate import judge
+from reports.gate_policy import GatePolicy
+from reports.gate_report import GateReport, render_json
+from reports.junit import render_junit
+from reports.markdown import render_markdown
+from reports.wording import counted
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("check", short_help="Pass or fail a run by a gate file, for nightly builds.")
+@click.argument("run", metavar="RUN", type=_FILE)
+@click.option("--policy-file", metavar="GATE.toml", type=_FILE, required=True, help="What is allowed; may be empty.")
+@click.option("--baseline", metavar="RUN0", type=_FILE, help="Compare with this run, within the bands of GATE.toml.")
+@click.option("--junit", metavar="FILE", type=_FILE, help="Write JUnit XML, for Jenkins and GitLab.")
+@click.option("--markdown", metavar="FILE", type=_FILE, help="Write Markdown, for a GitHub step summary.")
+@click.option("--json", "json_file", metavar="FILE", type=_FILE, help="Write everything as JSON (docs/nightly.md).")
+def command(
+    *,
+    run: Path,
+    policy_file: Path,
+    baseline: Path | None,
+    junit: Path | None,
+    markdown: Path | None,
+    json_file: Path | None,
+) -> ExitCode:
+    """Judge the run folder RUN by the limits of a gate file, and against a baseline by its bands.
+
+    An empty gate file checks only what --baseline implies: nothing lost, no other camera model, noise and errors not
+    larger, images not newly rejected, no new systematic error; docs/nightly.md has the default bands.
+
+    Exit codes: 0 passed; 1 a check failed; 2 wrong usage or gate file, or runs of different settings; 3 RUN or RUN0 is
+    no finished run, or RUN has inputs that could not be read; 4 a report file could not be written.
+    """
+    policy = read_gate_file(policy_file, has_baseline=baseline is not None)
+    run_read = read_run(run)
+    baseline_read = read_run(baseline) if baseline else None
+    if baseline_read:
+        refuse_different_settings([baseline_read, run_read])
+    report = _judged(policy, run_read, baseline_read)
+    print_page(render_gate(report, terminal_page()))
+    _write_all(
+        report, [(junit, render_junit), (markdown, lambda r: render_markdown(r).encode()), (json_file, _json_bytes)]
+    )
+    if report.unread:
+        return ExitCode.UNREADABLE_INPUT
+    return ExitCode.OK if report.passed else ExitCode.GATE_FAILED
+
+
+def _judged(policy: GatePolicy, run: ComparedRun, baseline: ComparedRun | None) -> GateReport:
+    comparison = compare(baseline.snapshot, run.snapshot) if baseline else None
+    checks = judge(policy, run.snapshot, comparison)
+    notes = []
+    if comparison is not None and comparison.nothing_in_common:
+        notes.append(OTHER_NAMES)
+    if baseline and baseline.unread:
+        notes.append(
+            f"{baseline.folder}: {counted(len(baseline.unread), 'input')} of the baseline could not be read, "
+            "and nothing is compared with it"
+        )
+    if baseline and baseline.info.get("version") != run.info.get("version"):
+        notes.append(
+            f"the baseline was made by sfm-audit {baseline.info.get('version')}, the run by {run.info.get('version')}"
+        )
+    if not checks:
+        notes.append("nothing was checked: the gate file has no limits, and there is no --baseline")
+    return GateReport(
+        str(run.folder),
+        str(baseline.folder) if baseline else None,
+        importlib.metadata.version("sfm-audit"),
+        dt.datetime.now(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+        checks,
+        comparison,
+        run.unread,
+        notes,
+    )
+
+
+def _json_bytes(report: GateReport) -> bytes:
+    return render_json(report).encode()
+
+
+def _write_all(report: GateReport, files: list[tuple[Path | None, Callable[[GateReport], bytes]]]) -> None:
+    """Write every file that can be written, then complain about the first that cannot."""
+    problems = []
+    for path, render in files:
+        if path is None:
+            continue
+        try:
+            write_file(path, render(report))
+        except KnownError as error:
+            problems.append(error)
+    for problem in problems[1:]:
+        print(f"sfm-audit: {problem}", file=sys.stderr)
+    if problems:
+        raise problems[0]

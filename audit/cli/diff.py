@@ -1,0 +1,36 @@
+"""``sfm-audit diff``: what changed between two runs, for people."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from audit.cli.auditing import print_page, terminal_page
+from audit.cli.errors import ExitCode
+from audit.cli.runs import different_settings, read_run
+from reports.comparison import compare
+from reports.comparison_page import render_comparison
+from reports.wording import plain
+
+
+@click.command("diff", short_help="Show what changed between two runs.")
+@click.argument("before", metavar="RUN0", type=click.Path(path_type=Path))
+@click.argument("after", metavar="RUN1", type=click.Path(path_type=Path))
+@click.option("--exit-code", is_flag=True, help="Exit with 1 if anything changed.")
+def command(*, before: Path, after: Path, exit_code: bool) -> ExitCode:
+    """Show what is different in RUN1: images newly rejected, fixed, lost, added; noise and errors per scene.
+
+    Images are compared by dataset, scene and name, so that components and ids may be renumbered.
+
+    Exit codes: 0 fine; 1 with --exit-code if anything changed; 3 RUN0 or RUN1 is no finished run.
+    """
+    runs = [read_run(before), read_run(after)]
+    problem = different_settings(runs)
+    if problem:
+        print(f"sfm-audit: {plain(problem)}: verdicts differ for that reason too", file=sys.stderr)
+    comparison = compare(runs[0].snapshot, runs[1].snapshot)
+    print_page(render_comparison(comparison, (str(before), str(after)), terminal_page()))
+    is_changed = any(change.anything for change in comparison.changes)
+    return ExitCode.GATE_FAILED if exit_code and is_changed else ExitCode.OK

@@ -1,0 +1,100 @@
+"""Which models does a command mean? Those at and below its PATHs, of a layout, of chosen scenes and components."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import click
+
+from audit.cli.errors import ExitCode, KnownError
+from loaders import Discovery, LoadError, discover
+from loaders.glance import count_images_of
+from loaders.layouts import LAYOUTS
+from loaders.locations import parse_location
+from loaders.selection import Selection, read_scene_list, select
+from reports.wording import plain
+
+UNKNOWN: Final = "-"
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a user asks for of what lies below the PATHs: models of one layout (None: of any), some of their scenes."""
+
+    layout: str | None = None
+    selection: Selection = field(default_factory=Selection)
+
+
+def with_choice_of_models(command: _Command) -> _Command:
+    """Add the options that choose models to a command; `wanted_of` takes what they say."""
+    layouts = click.Choice(["auto", *LAYOUTS])
+    options = (
+        click.option("--layout", type=layouts, default="auto", help="Only models that lie as this data set's do."),
+        click.option(
+            "--scene", "scenes", metavar="GLOB", multiple=True, help="Only scenes of such a name. Repeatable."
+        ),
+        click.option("--component", "components", metavar="GLOB", multiple=True, help="Only such components."),
+        click.option(
+            "--scene-list",
+            "scene_lists",
+            metavar="FILE",
+            multiple=True,
+            type=click.Path(path_type=Path),
+            help="Only the scenes named in FILE, one per line: scene, or scene/component.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def wanted_of(*, layout: str, scenes: Iterable[str], components: Iterable[str], scene_lists: Iterable[Path]) -> Wanted:
+    """Return what the options say.
+
+    Raises
+    ------
+    KnownError
+        A list of scenes cannot be read.
+    """
+    try:
+        lists = tuple(read_scene_list(path) for path in scene_lists)
+    except LoadError as error:
+        raise KnownError(str(error), ExitCode.USAGE) from error
+    selection = Selection(tuple(scenes), tuple(components), lists)
+    return Wanted(None if layout == "auto" else layout, selection)
+
+
+def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
+    """Return the models below the PATHs that are asked for; the others are left out.
+
+    Raises
+    ------
+    KnownError
+        A PATH is a URI that means nothing here, or holds a secret.
+    """
+    for path in paths:
+        try:
+            parse_location(path)
+        except LoadError as error:
+            raise KnownError(str(error), ExitCode.USAGE) from error
+    return select(discover(paths, wanted.layout), wanted.selection)
+
+
+def listed(found: Discovery) -> tuple[list[str], list[str]]:
+    """Return one line per model, and one per problem.
+
+    A line holds dataset, scene, component, number of images (- where the files do not say), bytes and location,
+    separated by tabs.
+    """
+    counts = count_images_of([ref.location for ref in found.refs])
+    lines = []
+    for ref, count in zip(found.refs, counts, strict=True):
+        images = UNKNOWN if isinstance(count, LoadError) else str(count)
+        cells = (ref.dataset, ref.scene, ref.component, images, str(ref.num_bytes), ref.model_path)
+        lines.append("\t".join(plain(cell) for cell in cells))
+    problems = [*found.errors, *(count for count in counts if isinstance(count, LoadError))]
+    return lines, [plain(str(problem)) for problem in problems]

@@ -1,0 +1,69 @@
+"""From a gate file to a policy; what is wrong with it is said in one line that names the key."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from audit.cli.errors import ExitCode, KnownError
+from audit.verdict import ReasonCode
+from reports.gate_policy import Band, GatePolicy, Limits, PartPolicy
+
+_KEYS_OF: Final[dict[str, type[BaseModel]]] = {
+    "limits": Limits,
+    "band": Band,
+    "dataset": PartPolicy,
+    "scene": PartPolicy,
+}
+
+
+def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
+    """Read and validate a gate file.
+
+    Raises
+    ------
+    KnownError
+        It cannot be read, has an unknown key or reason code, a value of the wrong kind, or a limit that needs a
+        baseline where there is none.
+    """
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise KnownError(f"{file}: cannot be read ({error.strerror})", ExitCode.USAGE) from error
+    except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError
+        raise KnownError(f"{file}: not a TOML file: {error}", ExitCode.USAGE) from error
+    try:
+        policy = GatePolicy.model_validate(content)
+    except ValidationError as error:
+        raise KnownError(f"{file}: {_problem(error.errors()[0])}", ExitCode.USAGE) from error
+    codes = {str(code) for code in ReasonCode}
+    for code in policy.reason_codes:
+        if code not in codes:
+            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code}; docs/verdicts.md lists them"
+            raise KnownError(problem, ExitCode.USAGE)
+    if policy.needs_baseline and not has_baseline:
+        raise KnownError(f"{file}: {policy.needs_baseline} needs --baseline RUN0", ExitCode.USAGE)
+    return policy
+
+
+def _problem(detail: ErrorDetails) -> str:
+    name = _dotted(detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        known: Any = next((_KEYS_OF[part] for part in reversed(detail["loc"][:-1]) if part in _KEYS_OF), GatePolicy)
+        return f"unknown key {name}; expected one of {', '.join(known.model_fields)}"
+    if detail["type"] == "missing":
+        return f"{name} is missing"
+    wanted = detail["msg"].removeprefix("Input should be ")
+    return f"{name}: expected {wanted}, found {detail['input']!r}"
+
+
+def _dotted(parts: tuple[int | str, ...]) -> str:
+    """Return scene[1].limits.min_images; the first section is [1], as people count."""
+    out = ""
+    for part in parts:
+        out += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    return out.removeprefix(".")

@@ -1,0 +1,113 @@
+"""One image's whole story for ``sfm-audit explain``: audited within its model, told and drawn. Imports matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from threadpoolctl import threadpool_limits
+
+from audit.cli.recompute import image_residuals_of, tau_px
+from audit.engine import ModelAuditor
+from audit.expected_error import expected_error_map, median_depth
+from audit.misfit import MisfitGroup, prepare_image
+from audit.table import ModelLabels
+from loaders.arrays import FloatArray
+from reports import figures
+from reports.explain import Story, render_story, strongest_where
+from reports.figures import CAPTIONS, Residuals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldImage:
+    """The story as text, and its pictures: file name -> content."""
+
+    text: str
+    pictures: Mapping[str, bytes]
+
+
+def tell(auditor: ModelAuditor, image_idx: int) -> ToldImage:
+    """Audit a model, and tell the story of the image in row ``image_idx``."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        row = _row(auditor, image_idx)
+        residuals = image_residuals_of(auditor, image_idx, row)
+        field_px = _explained_field(auditor, image_idx, row)
+        error_px = _expected_error(auditor, image_idx, row)
+    config = auditor.config.model_dump()
+    drawn = _figures(row, config, residuals, field_px, error_px)
+    where = None if field_px is None else strongest_where(residuals.xy_px, field_px, residuals.size_px)
+    names = {name: f"{number:02d}_{name}.png" for number, name in enumerate(drawn, 1)}
+    captions = {names[name]: CAPTIONS[name] for name in drawn}
+    text = render_story(Story(row, config, auditor.model.location, where, captions))
+    return ToldImage(text, {names[name]: _png(figure) for name, figure in drawn.items()})
+
+
+def _row(auditor: ModelAuditor, image_idx: int) -> dict[str, Any]:
+    """The image's row of the table ``images``: q-values need all images of the model."""
+    labels = ModelLabels("", "", "0", auditor.model.location)
+    row: dict[str, Any] = auditor.tables(labels).images.slice(image_idx, 1).to_pylist()[0]
+    return row
+
+
+def _explained_field(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> FloatArray | None:
+    """What the named misfit explains of the residuals (n, 2), on the model as it stands; None without one."""
+    camera = auditor.model.image(image_idx).camera
+    if camera is None or row["misfit_group"] is None:
+        return None
+    residuals_px = auditor.residuals.residuals_px[:, auditor.residuals.rows(image_idx)]
+    prepared = prepare_image(camera, _xyz_cam(auditor, image_idx))
+    field_px = prepared.explained_px(residuals_px, MisfitGroup(row["misfit_group"]))
+    return field_px.T if np.isfinite(field_px).all() else None
+
+
+def _expected_error(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> FloatArray | None:
+    """Expected measurement error over the image, px; None without a camera or with too little to tell."""
+    camera, sigma_px = auditor.model.image(image_idx).camera, row["sigma_constant_px"]
+    if camera is None or row["expected_error_px"] is None:
+        return None
+    facts, xyz_cam = auditor.facts[image_idx], _xyz_cam(auditor, image_idx)
+    if facts is None:
+        return None
+    depth = median_depth(camera, xyz_cam)
+    return expected_error_map(camera, facts.identifiability.parameters, sigma_px, depth).error_px
+
+
+def _xyz_cam(auditor: ModelAuditor, image_idx: int) -> FloatArray:
+    return auditor.model.image(image_idx).cam_from_world(auditor.inliers(image_idx).xyz_world)
+
+
+def _figures(
+    row: Mapping[str, Any],
+    config: Mapping[str, Any],
+    residuals: Residuals,
+    field_px: FloatArray | None,
+    error_px: FloatArray | None,
+) -> dict[str, Figure]:
+    drawn = {
+        "residual_vectors": figures.residual_vectors(residuals),
+        "residual_field": figures.residual_field(residuals),
+        "radial_profile": figures.radial_profile(residuals),
+        "misfit_groups": figures.misfit_groups(
+            row, tau_px=tau_px(config, row["sigma_constant_px"]), alpha=config["alpha"]
+        ),
+        "standardised_histogram": figures.standardised_histogram(residuals),
+        "qq_plot": figures.qq_plot(residuals),
+        "scale_comparison": figures.scale_comparison(residuals),
+    }
+    if field_px is not None:
+        what = f"vectors of the {str(row['misfit_group']).replace('_', ' ')} field"
+        field = figures.residual_vectors(residuals.replaced(field_px), what=what)
+        drawn = {"residual_vectors": drawn.pop("residual_vectors"), "explained_field": field, **drawn}
+    if error_px is not None:
+        drawn["expected_error"] = figures.expected_error(error_px, residuals.size_px)
+    return drawn
+
+
+def _png(figure: Figure) -> bytes:
+    content = BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

@@ -1,0 +1,65 @@
+"""``sfm-audit report``: one HTML file about a run, for people."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from audit.cli.auditing import print_page
+from audit.cli.errors import ExitCode, KnownError
+from audit.cli.extras import extra
+from reports.errors import OutputError, RunFolderError
+from reports.new_files import OutputExistsError, check_free, write_file
+from reports.reader import RunReader
+from reports.wording import counted, plain
+
+
+@click.command("report", short_help="Write one HTML page about a run, to look at and to send.")
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True)
+@click.option("--images", "photos", metavar="DIR", type=click.Path(path_type=Path), help="Folder of the photos.")
+@click.option(
+    "--worst", type=click.IntRange(0, 100), default=12, show_default=True, help="How many images get pictures."
+)
+@click.option("--force", is_flag=True, help="Replace the page if it is there.")
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+def command(*, run: Path, out: Path, photos: Path | None, worst: int, force: bool, quiet: bool) -> ExitCode:
+    """Write one HTML page about the run folder RUN: it needs no network and no other file.
+
+    Pictures of the worst images are drawn from RUN/observations (run --observations), or from the models where they
+    still lie where the run read them. With --images, photos are found as DIR/<name> or DIR/<scene>/images/<name>.
+
+    Exit codes: 0 fine; 2 wrong usage, or the page exists; 3 RUN is no run folder or cannot be read; 4 the page could
+    not be written.
+    """
+    try:
+        check_free(out, force=force)
+        if photos is not None and not photos.is_dir():
+            raise KnownError(f"{photos}: is no folder; name the folder of the photos", ExitCode.USAGE)
+        reader = _open(run)
+        with extra("report"):
+            from audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
+        page = make_page(reader, photos, worst, silent=quiet or not sys.stderr.isatty())
+        content = page.text.encode()
+        write_file(out, content)
+    except OutputExistsError as error:
+        raise KnownError(str(error), ExitCode.USAGE) from error
+    except RunFolderError as error:
+        raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
+    except OutputError as error:
+        raise KnownError(str(error), ExitCode.OUTPUT) from error
+    if not quiet:
+        what = f"{counted(page.num_images, 'image')}, pictures of {page.num_drawn}, {len(content) / 1e6:.1f} MB"
+        print_page(f"{plain(str(out))}: {what}")
+    return ExitCode.OK
+
+
+def _open(folder: Path) -> RunReader:
+    """Open a run folder, finished or not."""
+    run = RunReader.open(folder)
+    if not isinstance(run.info, dict) or not isinstance(run.info.get("config"), dict):
+        problem = "its run.json was not written by sfm-audit"
+        raise RunFolderError(folder, problem, "name the folder that run -o wrote")
+    return run

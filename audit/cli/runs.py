@@ -1,0 +1,96 @@
+"""Run folders that are compared: each read whole, or refused in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from audit.cli.errors import ExitCode, KnownError
+from reports.comparison import MissingColumnError, RunSnapshot
+from reports.errors import RunFolderError
+from reports.reader import RunReader
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedRun:
+    """A run folder and what its tables say."""
+
+    folder: Path
+    info: dict[str, Any]
+    snapshot: RunSnapshot
+
+    @property
+    def unread(self) -> list[tuple[str, str]]:
+        """Location and message of each input that could not be read."""
+        return [(str(item["location"]), str(item["message"])) for item in self.info.get("failures", [])]
+
+
+def read_run(folder: Path) -> ComparedRun:
+    """Read a run folder.
+
+    Raises
+    ------
+    KnownError
+        It holds no run, one that was not finished, or tables that cannot be read.
+    """
+    try:
+        run = RunReader.open(folder)
+    except RunFolderError as error:
+        raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
+    if not isinstance(run.info, dict) or not isinstance(run.info.get("config"), dict):
+        problem = f"{folder}: its run.json was not written by sfm-audit; name the folder that run -o wrote"
+        raise KnownError(problem, ExitCode.UNREADABLE_INPUT)
+    if run.info.get("status") != "complete":
+        problem = f"{folder}: the run was not finished; give its run command again, it goes on where it stopped"
+        raise KnownError(problem, ExitCode.UNREADABLE_INPUT)
+    try:
+        return ComparedRun(folder, run.info, RunSnapshot.read(run))
+    except (pa.ArrowException, OSError, MissingColumnError) as error:
+        problem = f"{folder}: its tables cannot be read ({error}); make the run again"
+        raise KnownError(problem, ExitCode.UNREADABLE_INPUT) from error
+
+
+def different_settings(runs: Sequence[ComparedRun]) -> str | None:
+    """Say in one line which settings two runs do not share; None where all of them are the same.
+
+    Settings that only one version of sfm-audit knows are not compared.
+    """
+    first = runs[0]
+    for other in runs[1:]:
+        old, new = first.info["config"], other.info["config"]
+        for name in sorted(old.keys() & new.keys()):
+            if old[name] != new[name]:
+                return f"{other.folder} was made with {name} = {new[name]}, {first.folder} with {old[name]}"
+    return None
+
+
+def refuse_different_settings(runs: Sequence[ComparedRun]) -> None:
+    """Refuse to judge verdicts that different settings have reached.
+
+    Raises
+    ------
+    KnownError
+        The runs do not share a setting.
+    """
+    problem = different_settings(runs)
+    if problem:
+        raise KnownError(f"{problem}; audit both with the same settings", ExitCode.USAGE)
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a report file, over an older one; devices such as /dev/stdout are written to.
+
+    Raises
+    ------
+    KnownError
+        The operating system refuses.
+    """
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        problem = f"{path}: cannot be written ({error.strerror}); choose another file"
+        raise KnownError(problem, ExitCode.OUTPUT) from error

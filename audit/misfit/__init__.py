@@ -1,0 +1,38 @@
+"""Is the camera model wrong, in which way, by how many pixels? (method.md section 5)."""
+
+from __future__ import annotations
+
+from audit.misfit.cause import advised_camera_model, bic, extended_camera, image_retest, named_cause, remaining_groups
+from audit.misfit.clusters import coincident_keypoints
+from audit.misfit.fields import GROUPS, MisfitGroup, candidate_fields
+from audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
+from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
+from audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design
+from audit.misfit.score import PreparedImage, prepare, prepare_image
+
+__all__ = [
+    "GROUPS",
+    "ImageDesign",
+    "MisfitGroup",
+    "MisfitStatus",
+    "MisfitTest",
+    "MisfitTests",
+    "PooledTests",
+    "PreparedImage",
+    "ProjectedImage",
+    "advised_camera_model",
+    "bic",
+    "camera_tests",
+    "candidate_fields",
+    "coincident_keypoints",
+    "extended_camera",
+    "fitted_param_idxs",
+    "image_design",
+    "image_retest",
+    "named_cause",
+    "nuisance_columns",
+    "prepare",
+    "prepare_image",
+    "project_image",
+    "remaining_groups",
+]

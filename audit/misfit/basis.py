@@ -1,0 +1,101 @@
+"""Orthonormal bases of a few long columns: exactly, or through their Gram matrix where that is as good.
+
+Columns are rows of (c, m) arrays here (m = 2n values each), so that every product runs along memory.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from loaders.arrays import FloatArray
+
+NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md section 5, step 1)
+FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection
+MAX_LEVERAGE: Final = 1.0 - 1e-9
+_CHUNK: Final = 512  # values per column and pass
+_SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, the exact path
+_SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
+_SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
+_SAFE_SQUARE: Final = 1e-280  # sums of squares between this and its inverse lost nothing to under- or overflow
+
+
+def unit_columns(columns: FloatArray) -> FloatArray:
+    """Return the columns (c, m) that are not zero, scaled to unit length; columns that are not finite become NaN."""
+    norms = column_norms(columns)
+    kept = norms != 0
+    if not kept.all():
+        columns, norms = columns[kept], norms[kept]
+    return np.asarray(columns / norms[:, None], dtype=np.float64)
+
+
+def column_norms(columns: FloatArray) -> FloatArray:
+    """Return the lengths of the columns (c, m), without overflow; NaN where a column is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.einsum("cm,cm->c", columns, columns)
+        if ((squares > _SAFE_SQUARE) & (squares < 1.0 / _SAFE_SQUARE)).all():
+            return np.asarray(np.sqrt(squares))
+        largest = np.abs(columns).max(axis=1, initial=0.0)
+        divisor = np.where(largest > 0, largest, 1.0)
+        return np.asarray(divisor * np.sqrt(np.sum((columns / divisor[:, None]) ** 2, axis=1)))
+
+
+def exact_basis(columns: FloatArray, threshold: float) -> FloatArray:
+    """Return (r, m): left singular vectors of the columns (c, m) whose singular value exceeds ``threshold``.
+
+    By QR and the singular values of its triangle, which is as accurate as the singular values of the columns.
+    """
+    orthogonal, triangle = np.linalg.qr(columns.T)
+    vectors, singular, _ = np.linalg.svd(triangle)
+    return np.ascontiguousarray((orthogonal @ vectors[:, : singular.size][:, singular > threshold]).T)
+
+
+def nuisance_basis(columns: FloatArray, *, exact: bool = False) -> FloatArray:
+    """Return Q, (q', m): an orthonormal basis of unit columns (q, m) with method.md's threshold.
+
+    The Gram path orthonormalises twice, so that Q is orthonormal to rounding wherever the path is taken.
+    """
+    if not len(columns):
+        return columns
+    if not exact:
+        values, vectors = np.linalg.eigh(columns @ columns.T)
+        if values[0] > _SMALLEST_PIVOT * values[-1]:
+            basis = (vectors / np.sqrt(values)).T @ columns
+            values, vectors = np.linalg.eigh(basis @ basis.T)
+            return np.asarray((vectors / np.sqrt(values)).T @ basis, dtype=np.float64)
+    largest = np.linalg.svd(np.linalg.qr(columns.T, mode="r"), compute_uv=False)[0]
+    return exact_basis(columns, NUISANCE_THRESHOLD * largest)
+
+
+def project_off(basis: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return columns (..., m) minus their projections on an orthonormal basis (q, m)."""
+    return np.asarray(columns - (columns @ basis.T) @ basis, dtype=np.float64)
+
+
+def project_off_in_place(basis: FloatArray, columns: FloatArray) -> FloatArray:
+    """Project columns (c, m) off an orthonormal basis (q, m), in place; return their coordinates on it before."""
+    coordinates = columns @ basis.T
+    for start in range(0, basis.shape[1], _CHUNK):  # a small scratch array: fresh memory is dearer than arithmetic
+        part = slice(start, start + _CHUNK)
+        columns[:, part] -= coordinates @ basis[:, part]
+    return np.asarray(coordinates)
+
+
+def field_transform(gram: FloatArray, largest_sq: float) -> FloatArray | None:
+    """Return W, (c, r), such that W^T E is orthonormal, from E's Gram matrix (c, c) after projection.
+
+    Parameters
+    ----------
+    largest_sq : the largest squared singular value of E *before* projection
+
+    Returns
+    -------
+    FloatArray or None
+        None where the Gram matrix cannot tell which directions exceed `FIELD_THRESHOLD`.
+    """
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > _SURE_FIELD * largest_sq
+    if (values[~kept] > _SURE_NULL * largest_sq).any():
+        return None
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]), dtype=np.float64)

@@ -1,0 +1,342 @@
+"""Is a camera wrong that several images share? Scores pooled over its images (method.md section 5, *Cameras*).
+
+The nuisances are the poses of all images and, once, the fitted intrinsics; every candidate field is one column over all
+images. Nothing of size observations x images is ever built: one pass accumulates the normal matrices of what is left
+of intrinsics and fields after each image's own pose, a second pass the scores of the tracks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from audit.misfit import basis
+from audit.misfit.fields import GROUP_COLUMNS, GROUPS, NUM_FIELDS, MisfitGroup, candidate_fields
+from audit.misfit.nuisance import fitted_param_idxs, project_image
+from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
+from loaders.arrays import BoolArray, FloatArray, IntArray
+from loaders.model import CameraRecord
+
+_SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns: below it, the triangular factor by QR
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageDesign:
+    """One image of the camera.
+
+    pose: (6, 2, n) px per unit.    intrinsics: (k, 2, n) px per unit of the parameters that were fitted.
+    fields: (42, 2, n) px per unit. residuals_px: (2, n) observed minus projected.    track: (n,) 0 .. num_tracks - 1.
+    """
+
+    pose: FloatArray
+    intrinsics: FloatArray
+    fields: FloatArray
+    residuals_px: FloatArray
+    track: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledTests:
+    """The tests of one camera; how many images (with observations), observations and tracks took part, 0 if none."""
+
+    tests: MisfitTests
+    num_images: int
+    num_observations: int
+    num_tracks: int
+
+
+def image_design(
+    camera: CameraRecord,
+    xyz_cam: FloatArray,
+    residuals_px: FloatArray,
+    track: IntArray,
+    *,
+    param_idxs: tuple[int, ...] | None = None,
+) -> ImageDesign:
+    """Return an image's part of the pooled test, from its points (n, 3) in the camera frame and residuals (2, n)."""
+    projected = project_image(camera, xyz_cam)
+    chosen = fitted_param_idxs(camera.model) if param_idxs is None else param_idxs
+    fields = candidate_fields(camera, projected)
+    return ImageDesign(projected.pose, projected.d_params[list(chosen)], fields, residuals_px, track)
+
+
+def camera_tests(
+    designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int, *, exact: bool = False
+) -> PooledTests:
+    """Test a camera on all its images at once.
+
+    Parameters
+    ----------
+    designs : gives image 0 .. num_images - 1; called twice for each (three times if a rank is in doubt), so that only
+        one image needs to be in memory
+    num_tracks : tracks are numbered below it; those without observations do not count
+    exact : take the triangular factor by QR instead of from normal matrices
+
+    Returns
+    -------
+    PooledTests
+        Not enough evidence with fewer than 4 r tracks.
+
+    Notes
+    -----
+    H0: residuals are independent between tracks (not within), with mean zero off the nuisances. T = s^T M^-1 s against
+    chi^2(r), which needs many tracks: unlike the test of one image it is not exact under Gaussian noise.
+
+    Memory: 8 bytes x 42 x num_tracks for the scores, beside one image's columns.
+    """
+    normal = _first_pass(designs, num_images, num_tracks)
+    if isinstance(normal, MisfitStatus):
+        return PooledTests({group: not_tested(normal) for group in GROUPS}, 0, 0, 0)
+    solution = None if exact else _solve_normal(normal)
+    if solution is None:
+        solution = _solve_triangle(_triangle(designs, num_images, normal), normal)
+    return _second_pass(designs, num_images, num_tracks, normal, solution)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """What the first pass leaves; C: the k intrinsics, E: the fields, both off the poses and of unit length before.
+
+    gram: (k + 42, k + 42) of [C, E].          before: (k + 42, k + 42) the same before projection.
+    on_y: (k + 42,) [C, E]^T y.                scale: (k + 42,) 1 / length before projection, 0 for zero columns.
+    refused: groups with derivatives that are not finite.    num_free: values that the poses leave free.
+    """
+
+    gram: FloatArray
+    before: FloatArray
+    on_y: FloatArray
+    scale: FloatArray
+    refused: frozenset[MisfitGroup]
+    num_free: int
+    num_images: int
+    num_observations: int
+    num_tracks: int
+
+    @property
+    def num_intrinsics(self) -> int:
+        return len(self.scale) - NUM_FIELDS
+
+    def columns(self, group: MisfitGroup) -> slice:
+        """Of a group, behind the intrinsics."""
+        own = GROUP_COLUMNS[group]
+        return slice(own.start + self.num_intrinsics, own.stop + self.num_intrinsics)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """How to go from C and E to orthonormal columns.
+
+    to_basis: (k, k') C to_basis is an orthonormal basis Qc of the intrinsics.    on_basis: (k', 42) Qc^T E.
+    transform: U = (E - Qc on_basis) transform per group, (c, r).
+    """
+
+    to_basis: FloatArray
+    on_basis: FloatArray
+    transform: dict[MisfitGroup, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _OffPose:
+    """One image with its pose profiled: columns (k + 42, 2n), coordinates on the pose before (k + 42, q), y (2n,)."""
+
+    columns: FloatArray
+    coordinates: FloatArray
+    y: FloatArray
+    pose_leverage: FloatArray
+    finite: BoolArray
+
+
+def _off_pose(design: ImageDesign) -> _OffPose | None:
+    """None where the pose's derivatives are not finite; other columns that are not are zeroed, and said so."""
+    pose = basis.unit_columns(design.pose.reshape(len(design.pose), -1))
+    if not np.isfinite(pose).all():
+        return None
+    q = basis.nuisance_basis(pose)
+    columns = np.concatenate([design.intrinsics, design.fields]).reshape(-1, q.shape[1])
+    finite = np.isfinite(basis.column_norms(columns))
+    columns[~finite] = 0.0
+    coordinates = basis.project_off_in_place(q, columns)
+    basis.project_off_in_place(q, columns)
+    y = basis.project_off(q, design.residuals_px.reshape(-1))
+    return _OffPose(columns, coordinates, y, np.einsum("qm,qm->m", q, q), finite)
+
+
+class _Sums:
+    """The first pass, image by image."""
+
+    def __init__(self, num_intrinsics: int, num_tracks: int) -> None:
+        size = num_intrinsics + NUM_FIELDS
+        self.gram, self.before, self.on_y = np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
+        self.finite = np.ones(size, dtype=np.bool_)
+        self.seen = np.zeros(num_tracks, dtype=np.bool_)
+        self.num_images = self.num_observations = self.num_free = 0
+
+    def add(self, part: _OffPose, track: IntArray) -> None:
+        own = part.columns @ part.columns.T
+        self.gram += own
+        self.before += own + part.coordinates @ part.coordinates.T
+        self.on_y += part.columns @ part.y
+        self.finite &= part.finite
+        self.seen[track] = True
+        self.num_images += 1
+        self.num_observations += len(track)
+        self.num_free += len(part.y) - part.coordinates.shape[1]
+
+    def normal(self) -> _Normal:
+        """Scale to columns of unit length."""
+        length = np.sqrt(np.diagonal(self.before))
+        scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
+        both = scale * scale[:, None]
+        of_fields = self.finite[len(scale) - NUM_FIELDS :]
+        return _Normal(
+            self.gram * both,
+            self.before * both,
+            self.on_y * scale,
+            scale,
+            frozenset(group for group, columns in GROUP_COLUMNS.items() if not of_fields[columns].all()),
+            self.num_free,
+            self.num_images,
+            self.num_observations,
+            int(np.count_nonzero(self.seen)),
+        )
+
+
+def _first_pass(
+    designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int
+) -> _Normal | Literal[MisfitStatus.NO_FIELDS, MisfitStatus.NOT_FINITE, MisfitStatus.NOT_ENOUGH_EVIDENCE]:
+    """Accumulate over images; or say why nothing can be tested."""
+    sums: _Sums | None = None
+    for i in range(num_images):
+        design = designs(i)
+        if not len(design.fields):
+            return MisfitStatus.NO_FIELDS
+        if not len(design.track):
+            continue
+        part = _off_pose(design)
+        if part is None or not part.finite[: len(design.intrinsics)].all():
+            return MisfitStatus.NOT_FINITE
+        sums = sums or _Sums(len(design.intrinsics), num_tracks)
+        sums.add(part, design.track)
+    if sums is None:
+        return MisfitStatus.NOT_ENOUGH_EVIDENCE
+    return sums.normal() if np.isfinite(sums.before).all() else MisfitStatus.NOT_FINITE
+
+
+def _largest_sq(normal: _Normal, group: MisfitGroup) -> float:
+    """Largest squared singular value of a group before projection."""
+    columns = normal.columns(group)
+    return float(np.linalg.eigvalsh(normal.before[columns, columns])[-1])
+
+
+def _solve_normal(normal: _Normal) -> _Solution | None:
+    """Solve through the normal matrices; None where they leave a rank in doubt."""
+    k = normal.num_intrinsics
+    used = normal.scale[:k] > 0
+    to_basis = np.zeros((k, int(np.count_nonzero(used))))
+    if used.any():
+        values, vectors = np.linalg.eigh(normal.gram[:k, :k][np.ix_(used, used)])
+        if values[0] <= _SMALLEST_PIVOT:
+            return None
+        to_basis[used] = vectors / np.sqrt(values)
+    on_basis = to_basis.T @ normal.gram[:k, k:]
+    left = normal.gram[k:, k:] - on_basis.T @ on_basis
+    transforms = {}
+    for group in GROUPS:
+        if group in normal.refused:
+            continue
+        columns = GROUP_COLUMNS[group]
+        transform = basis.field_transform(left[columns, columns], _largest_sq(normal, group))
+        if transform is None:
+            return None
+        transforms[group] = transform
+    return _Solution(to_basis, on_basis, transforms)
+
+
+def _triangle(designs: Callable[[int], ImageDesign], num_images: int, normal: _Normal) -> FloatArray:
+    """(k + 42, k + 42) R with R^T R the normal matrix, without squaring anything: QR of one image after the other."""
+    triangle = np.zeros((0, len(normal.scale)))
+    for i in range(num_images):
+        design = designs(i)
+        part = _off_pose(design) if len(design.track) else None
+        if part is not None:
+            rows = (part.columns * normal.scale[:, None]).T
+            triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
+    return triangle
+
+
+def _solve_triangle(triangle: FloatArray, normal: _Normal) -> _Solution:
+    """Solve as the dense problem is solved, with the triangle in the place of the columns."""
+    k = normal.num_intrinsics
+    left, singular, right = np.linalg.svd(triangle[:, :k], full_matrices=False)
+    threshold = basis.NUISANCE_THRESHOLD * math.sqrt(float(np.linalg.eigvalsh(normal.before[:k, :k])[-1])) if k else 0.0
+    kept = singular > threshold
+    q = left[:, kept]
+    on_basis = q.T @ triangle[:, k:]
+    fields = triangle[:, k:] - q @ on_basis
+    again = q.T @ fields
+    fields = fields - q @ again
+    transforms = {}
+    for group in GROUPS:
+        if group in normal.refused:
+            continue
+        _, lengths, vectors = np.linalg.svd(fields[:, GROUP_COLUMNS[group]], full_matrices=False)
+        sure = lengths > basis.FIELD_THRESHOLD * math.sqrt(_largest_sq(normal, group))
+        transforms[group] = vectors[sure].T / lengths[sure]
+    return _Solution(right[kept].T / singular[kept], on_basis + again, transforms)
+
+
+def _second_pass(
+    designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int, normal: _Normal, solution: _Solution
+) -> PooledTests:
+    """Sum scores and, per track, what the meat is made of; judge."""
+    k = normal.num_intrinsics
+    on_basis_y = solution.to_basis.T @ normal.on_y[:k]
+    num_fields = len(normal.scale) - k
+    per_track, scores = np.zeros((num_tracks, num_fields)), np.zeros(num_fields)
+    last_row = np.empty(num_tracks, dtype=np.int64)
+    for i in range(num_images):
+        design = designs(i)
+        part = _off_pose(design) if len(design.track) else None
+        if part is None:
+            continue
+        part.columns[...] *= normal.scale[:, None]
+        qc = solution.to_basis.T @ part.columns[:k]
+        fields = part.columns[k:] - solution.on_basis.T @ qc
+        y = part.y - on_basis_y @ qc
+        leverage = np.minimum(part.pose_leverage + np.einsum("qm,qm->m", qc, qc), basis.MAX_LEVERAGE)
+        weighted = (y / np.sqrt(1.0 - leverage)).reshape(2, -1)
+        g = np.einsum("cin,in->nc", fields.reshape(num_fields, 2, -1), weighted)
+        _add_rows(per_track, design.track, g, last_row)
+        scores += fields @ y
+    meat = per_track.T @ per_track
+    tests = {group: _judged(group, scores, meat, normal, solution) for group in GROUPS}
+    return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)
+
+
+def _add_rows(target: FloatArray, rows: IntArray, values: FloatArray, last_row: IntArray) -> None:
+    """Add values (n, c) to rows of target in place, also where a track is seen twice; last_row: scratch."""
+    number = np.arange(len(rows))
+    last_row[rows] = number
+    if (last_row[rows] == number).all():
+        target[rows] += values
+    else:
+        np.add.at(target, rows, values)
+
+
+def _judged(
+    group: MisfitGroup, scores: FloatArray, meat: FloatArray, normal: _Normal, solution: _Solution
+) -> MisfitTest:
+    if group in normal.refused:
+        return not_tested(MisfitStatus.NOT_FINITE)
+    columns, transform = GROUP_COLUMNS[group], solution.transform[group]
+    if normal.num_free - solution.to_basis.shape[1] < columns.stop - columns.start:
+        return not_tested(MisfitStatus.NOT_ENOUGH_EVIDENCE)
+    refused = refusal(transform.shape[1], normal.num_tracks)
+    if refused is not None:
+        return refused
+    own_meat = transform.T @ meat[columns, columns] @ transform
+    return judged_by_chi2(transform.T @ scores[columns], own_meat, normal.num_observations)

@@ -1,0 +1,230 @@
+"""Is the camera model wrong? The score test of one image (method.md section 5, steps 1 to 4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from audit.misfit import basis
+from audit.misfit.fields import GROUP_COLUMNS, MisfitGroup, candidate_fields
+from audit.misfit.nuisance import nuisance_columns, project_image
+from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_f, not_tested, refusal
+from loaders.arrays import FloatArray, IntArray
+from loaders.model import CameraRecord
+
+_NO_TRANSFORM: Final = np.empty((0, 0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """Observations that count as one in the meat: ``order`` (n,) sorts them, ``starts`` (K,) begin each cluster."""
+
+    order: IntArray
+    starts: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedGroup:
+    """A group's orthonormal fields are U = transform^T fields[columns]; ``refused`` where it cannot be tested.
+
+    columns: of PreparedImage.fields.    transform: (c, r).
+    """
+
+    columns: slice
+    transform: FloatArray
+    refused: MisfitTest | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedImage:
+    """What of the score test depends on the camera and the points alone; `test` then takes any residuals.
+
+    nuisance_basis: (q', 2n) Q.                fields: (42, 2, n) candidate fields, projected off Q.
+    inverse_root: (2, n) 1 / sqrt(1 - h).      clusters: None when every observation is its own.
+    """
+
+    nuisance_basis: FloatArray
+    fields: FloatArray
+    inverse_root: FloatArray
+    groups: dict[MisfitGroup, PreparedGroup]
+    clusters: Clusters | None = None
+
+    @property
+    def num_observations(self) -> int:
+        """Observations per test."""
+        return int(self.inverse_root.shape[1])
+
+    @property
+    def num_clusters(self) -> int:
+        """Independent ones among them."""
+        return self.num_observations if self.clusters is None else len(self.clusters.starts)
+
+    def test(self, residuals_px: FloatArray) -> MisfitTests:
+        """Test residuals (2, n), observed minus projected, px, of the points the image was prepared with.
+
+        Steps 2 to 4. Costs a fifth of the preparation.
+        """
+        if all(group.refused for group in self.groups.values()):
+            return {name: group.refused for name, group in self.groups.items() if group.refused}
+        with np.errstate(over="ignore", invalid="ignore"):  # residuals beyond 1e150 px: the meat is singular
+            return self._tests(residuals_px)
+
+    def _tests(self, residuals_px: FloatArray) -> MisfitTests:
+        y = basis.project_off(self.nuisance_basis, residuals_px.reshape(-1))
+        scores = self.fields.reshape(len(self.fields), -1) @ y
+        per_cluster = self._per_cluster(y.reshape(2, -1) * self.inverse_root)
+        tests = {}
+        for name, group in self.groups.items():
+            if group.refused is not None:
+                tests[name] = group.refused
+                continue
+            g = per_cluster[group.columns]
+            meat = group.transform.T @ (g @ g.T) @ group.transform  # M = sum_k g_k g_k^T
+            s = group.transform.T @ scores[group.columns]
+            tests[name] = judged_by_f(s, meat, self.num_clusters, self.num_observations)
+        return tests
+
+    def explained_px(self, residuals_px: FloatArray, group: MisfitGroup) -> FloatArray:
+        """Return (2, n) px, U U^T y: the group's share of the residuals, NaN where it is not tested.
+
+        Its RMS length contains the noise that r directions explain anyway; ``MisfitTest.px`` is cleaned of it.
+        """
+        prepared = self.groups[group]
+        if prepared.refused is not None:
+            return np.full_like(residuals_px, math.nan)
+        y = basis.project_off(self.nuisance_basis, residuals_px.reshape(-1))
+        own = self.fields[prepared.columns].reshape(len(prepared.transform), -1)
+        along = prepared.transform @ (prepared.transform.T @ (own @ y))
+        return np.asarray((along @ own).reshape(residuals_px.shape))
+
+    def _per_cluster(self, weighted: FloatArray) -> FloatArray:
+        """(42, K): both rows of each point of fields * y / sqrt(1 - h), summed, then summed over clusters."""
+        g = np.einsum("cin,in->cn", self.fields, weighted)
+        if self.clusters is None:
+            return np.asarray(g)
+        return np.asarray(np.add.reduceat(g[:, self.clusters.order], self.clusters.starts, axis=1))
+
+
+def prepare_image(
+    camera: CameraRecord,
+    xyz_cam: FloatArray,
+    *,
+    param_idxs: tuple[int, ...] | None = None,
+    clusters: IntArray | None = None,
+) -> PreparedImage:
+    """Prepare the score test of an image from its camera and its points (n, 3) in the camera frame.
+
+    The cheapest way when nobody else needs the columns; see `nuisance_columns` and `prepare` for the rest.
+    """
+    projected = project_image(camera, xyz_cam)
+    nuisance = nuisance_columns(camera.model, projected, param_idxs)
+    return _prepare(nuisance, candidate_fields(camera, projected), clusters, exact=False)
+
+
+def prepare(
+    nuisance: FloatArray,
+    fields: FloatArray,
+    *,
+    rows: IntArray | None = None,
+    clusters: IntArray | None = None,
+    exact: bool = False,
+) -> PreparedImage:
+    """Do all of the score test that does not need the residuals.
+
+    Parameters
+    ----------
+    nuisance : (q, 2, n) N, from `nuisance_columns`
+    fields : (42, 2, n) E, from `candidate_fields`, or (0, 2, n) for spherical cameras
+    rows : observations to use; all by default. Residuals and clusters are then those of these rows
+    clusters : (n,) observations of equal number, >= 0, count as one in the meat; each counts by itself by default
+    exact : never take the Gram path
+
+    Notes
+    -----
+    Step 1. H0: the residuals are independent between clusters and have mean zero off the span of N; their variance and
+    shape are free. Blind to fields in the span of N, and to what the 3D points or the poses of other images absorbed.
+
+    Any basis of the projected fields gives the same T; orthonormality matters only for px. An orthonormal basis comes
+    from the Gram matrix unless that leaves a rank in doubt (points in a small part of the image, planar scenes).
+    """
+    if rows is not None:
+        nuisance, fields = nuisance[:, :, rows], fields[:, :, rows]
+    return _prepare(nuisance, np.array(fields, dtype=np.float64, order="C"), clusters, exact=exact)
+
+
+def _prepare(nuisance: FloatArray, fields: FloatArray, clusters: IntArray | None, *, exact: bool) -> PreparedImage:
+    """`prepare` in place of ``fields``."""
+    n = fields.shape[2]
+    clustered = _clusters_of(clusters)
+    columns = basis.unit_columns(nuisance.reshape(len(nuisance), -1))
+    status = MisfitStatus.TESTED
+    if not len(fields):
+        status = MisfitStatus.NO_FIELDS
+    elif n == 0:
+        status = MisfitStatus.NOT_ENOUGH_EVIDENCE
+    elif not np.isfinite(columns).all():
+        status = MisfitStatus.NOT_FINITE
+    if status is not MisfitStatus.TESTED:
+        groups = {
+            group: PreparedGroup(where, _NO_TRANSFORM, not_tested(status)) for group, where in GROUP_COLUMNS.items()
+        }
+        return PreparedImage(np.empty((0, 2 * n)), np.empty((0, 2, n)), np.ones((2, n)), groups, clustered)
+    q = basis.nuisance_basis(columns, exact=exact)
+    num_clusters = n if clustered is None else len(clustered.starts)
+    groups = _project_fields(q, fields.reshape(len(fields), -1), num_clusters, exact=exact)
+    leverage = np.minimum(np.einsum("qm,qm->m", q, q), basis.MAX_LEVERAGE)
+    return PreparedImage(q, fields, (1.0 / np.sqrt(1.0 - leverage)).reshape(2, n), groups, clustered)
+
+
+def _clusters_of(clusters: IntArray | None) -> Clusters | None:
+    """None if each observation is its own."""
+    if clusters is None:
+        return None
+    order = np.argsort(clusters, kind="stable").astype(np.int64)
+    starts = np.flatnonzero(np.diff(clusters[order], prepend=-1)).astype(np.int64)
+    return None if len(starts) == len(clusters) else Clusters(order, starts)
+
+
+def _project_fields(
+    q: FloatArray, fields: FloatArray, num_clusters: int, *, exact: bool
+) -> dict[MisfitGroup, PreparedGroup]:
+    """Scale fields (42, m) to unit length and project them off Q, in place; return each group's basis within them."""
+    norms = basis.column_norms(fields)
+    finite = np.isfinite(norms)
+    fields[~finite] = 0.0
+    fields *= (1.0 / np.where(finite & (norms > 0), norms, 1.0))[:, None]
+    on_nuisance = basis.project_off_in_place(q, fields)
+    free_values = fields.shape[1] - len(q)
+    groups = {}
+    for group, columns in GROUP_COLUMNS.items():
+        refused = None
+        if not finite[columns].all():
+            refused = not_tested(MisfitStatus.NOT_FINITE)
+        elif free_values < columns.stop - columns.start:
+            refused = not_tested(MisfitStatus.NOT_ENOUGH_EVIDENCE)
+        transform = _NO_TRANSFORM
+        if refused is None:
+            transform = _orthonormalise(q, fields[columns], on_nuisance[columns], exact=exact)
+            refused = refusal(transform.shape[1], num_clusters)
+        groups[group] = PreparedGroup(columns, transform, refused)
+    return groups
+
+
+def _orthonormalise(q: FloatArray, own: FloatArray, on_nuisance: FloatArray, *, exact: bool) -> FloatArray:
+    """Return W, (c, r), such that W^T own is orthonormal; where that takes the exact path, ``own`` is replaced.
+
+    The Gram path keeps singular values above 1e-5 only: what one projection leaves of Q is 1e-11 of them. The exact
+    path keeps smaller ones and projects twice.
+    """
+    gram = own @ own.T
+    largest_sq = float(np.linalg.eigvalsh(gram + on_nuisance @ on_nuisance.T)[-1])  # of the fields before projection
+    transform = None if exact else basis.field_transform(gram, largest_sq)
+    if transform is None:
+        basis.project_off_in_place(q, own)
+        orthonormal = basis.exact_basis(own, basis.FIELD_THRESHOLD * math.sqrt(largest_sq))
+        own[: len(orthonormal)] = orthonormal
+        transform = np.eye(len(own))[:, : len(orthonormal)]
+    return transform

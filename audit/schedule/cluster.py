@@ -1,0 +1,149 @@
+"""How are models audited on a Dask cluster? One task per model; the tables come back and are written here.
+
+Dask decides where a model is audited and starts it again where a worker is lost; what is computed does not depend on
+it. Only so many models are asked for at a time as keep the workers busy, so that finished tables do not pile up.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, cast
+
+import dask
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from threadpoolctl import threadpool_limits
+
+from audit.schedule.errors import ClusterError
+from audit.schedule.task import AuditFunction, Outcome, Task, died_twice
+
+LOCAL: Final = "local"
+_LOOPBACK: Final = "127.0.0.1"
+_CONNECT_SECONDS: Final = 30
+_FIRST_WORKER_SECONDS: Final = 300
+_AHEAD: Final = 2  # models asked for per thread of the workers
+_LOST: Final = "the cluster was lost; what was finished stays, the same command goes on"
+
+
+def in_cluster(tasks: Sequence[Task], address: str, jobs: int, audit: AuditFunction) -> Generator[tuple[Task, Outcome]]:
+    """Yield outcomes as they come from the workers of the scheduler at ``address``.
+
+    A model whose worker was lost more often than the cluster allows is tried once more, alone, when all others are
+    finished.
+
+    Parameters
+    ----------
+    address : such as tcp://host:8786, or ``local``: ``jobs`` workers of one thread each on this machine, loopback only
+
+    Raises
+    ------
+    ClusterError
+        No scheduler or no worker answers, a worker has another version of sfm-audit, or the cluster was lost.
+    """
+    version = importlib.metadata.version("sfm-audit")
+    with _client(address, jobs) as client:
+        again: list[Task] = []
+        for task, outcome in _run(client, tasks, audit, version):
+            if outcome is None:
+                again.append(task)
+            else:
+                yield task, outcome
+        for task in again:
+            for _, outcome in _run(client, [task], audit, version):
+                yield task, outcome or died_twice(task, "its Dask worker was lost")
+
+
+def _run(
+    client: Client, tasks: Sequence[Task], audit: AuditFunction, version: str
+) -> Iterator[tuple[Task, Outcome | None]]:
+    """Yield outcomes; None for a model whose workers were lost."""
+    waiting = iter(tasks)
+    task_of: dict[Any, Task] = {}
+    ended = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+
+    def ask() -> None:
+        while len(task_of) < _AHEAD * max(1, sum(client.nthreads().values())):
+            task = next(waiting, None)
+            if task is None:
+                return
+            future = client.submit(_audit_there, audit, task, version, pure=False)
+            task_of[future.key] = task
+            ended.add(future)
+
+    try:
+        ask()
+        while task_of:
+            future, result = next(ended)
+            task = task_of.pop(future.key)
+            ask()
+            yield task, _outcome(future, result)
+    except (OSError, TimeoutError) as error:
+        raise ClusterError(_LOST) from error
+
+
+def _outcome(future: Future[Any], result: Any) -> Outcome | None:
+    if future.status == "finished":
+        return cast("Outcome", result)
+    if future.status == "error":
+        _, error, trace = result
+        if isinstance(error, KilledWorker):
+            return None
+        raise error.with_traceback(trace)
+    raise ClusterError(_LOST)
+
+
+def _audit_there(audit: AuditFunction, task: Task, version: str) -> Outcome:
+    """Run on a worker."""
+    own = importlib.metadata.version("sfm-audit")
+    if own != version:
+        advice = "install the same version on all machines"
+        raise ClusterError(f"a Dask worker has sfm-audit {own}, this machine {version}; {advice}")
+    threadpool_limits(limits=1)
+    return audit(task)
+
+
+@contextmanager
+def _client(address: str, jobs: int) -> Iterator[Client]:
+    if address == LOCAL:
+        settings = {
+            "distributed.scheduler.allowed-failures": 0,  # a model that kills its worker is tried once more by us
+            "distributed.scheduler.http.routes": [],
+            "distributed.worker.http.routes": [],
+        }
+        with (
+            dask.config.set(settings),
+            _local_cluster(jobs) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ClusterError(f"--dask {address}: no Dask scheduler answers ({error}); start one, or use local") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_FIRST_WORKER_SECONDS)
+        except TimeoutError as error:
+            advice = f"start some: dask worker {address}"
+            raise ClusterError(f"--dask {address}: no worker in {_FIRST_WORKER_SECONDS} s; {advice}") from error
+        yield client
+
+
+def _local_cluster(jobs: int) -> LocalCluster:
+    try:
+        return LocalCluster(
+            n_workers=jobs,
+            threads_per_worker=1,
+            host=_LOOPBACK,
+            dashboard_address=f"{_LOOPBACK}:0",
+            worker_dashboard_address=f"{_LOOPBACK}:0",
+            scheduler_kwargs={"dashboard": False},
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        )
+    except RuntimeError as error:  # a worker died while it started
+        reason = " ".join(str(error).split())
+        raise ClusterError(f"--dask local: the workers did not start ({reason}); run it again") from error

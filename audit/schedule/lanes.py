@@ -1,0 +1,178 @@
+"""How are calls run in other processes? So that the death of one costs nothing but its own call.
+
+concurrent.futures' pool breaks as a whole when one process dies, and waits for ever for the rest of an answer that a
+killed process had half written, because it holds both ends of the pipe. Here every process has a pipe of its own, and
+only the process holds the end that it writes to.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+from typing import Any, Final, Generic, Self, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+_SPAWN: Final = multiprocessing.get_context("spawn")
+_BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_LEAVING_SECONDS: Final = 5.0  # that an idle process may take to leave before it is made to
+
+K = TypeVar("K")
+
+
+@dataclass(frozen=True, slots=True)
+class Died:
+    """The answer of a process that is gone. exit_code: its own, or minus the number of the signal that killed it."""
+
+    exit_code: int | None
+
+    def __str__(self) -> str:
+        if self.exit_code is not None and self.exit_code < 0:
+            return f"killed by {signal.Signals(-self.exit_code).name}"
+        return f"exit code {self.exit_code}"
+
+
+class ProcessDiedError(RuntimeError):
+    """A process that a call in another process had started is gone."""
+
+
+class RemoteTracebackError(Exception):
+    """Where an error was raised, in the process that met it."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Raised:
+    error: BaseException
+    trace: str
+
+
+@dataclass(slots=True, eq=False)
+class _Lane:
+    process: multiprocessing.process.BaseProcess
+    connection: Connection
+
+
+class Lanes(Generic[K]):
+    """Processes that run one call at a time each; they are started when they are needed and kept until the end.
+
+    Use as a context manager: a normal exit waits for the processes to leave, an error ends them at once. Processes that
+    are killed are replaced. They also leave when this process is killed.
+    """
+
+    def __init__(self) -> None:
+        self._idle: list[_Lane] = []
+        self._busy: dict[Connection, tuple[_Lane, K]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        lanes = [*self._idle, *(lane for lane, _ in self._busy.values())]
+        for lane in lanes:
+            lane.connection.close()  # an idle process reads the end of its input and leaves
+            if error is not None:
+                lane.process.terminate()
+        for lane in lanes:
+            lane.process.join(_LEAVING_SECONDS)
+            if lane.process.is_alive():
+                lane.process.kill()
+                lane.process.join()
+        self._idle, self._busy = [], {}
+
+    @property
+    def num_busy(self) -> int:
+        """How many calls are under way."""
+        return len(self._busy)
+
+    def warm_up(self, num_processes: int) -> None:
+        """Start processes now, so that they are ready when they are needed."""
+        self._idle += [_open_lane() for _ in range(num_processes - len(self._idle))]
+
+    def start(self, key: K, function: Callable[..., Any], *arguments: Any) -> None:
+        """Run a call in an idle process, or in a new one; the function must be importable by name."""
+        while True:
+            lane = self._idle.pop() if self._idle else _open_lane()
+            try:
+                lane.connection.send((function, arguments))
+            except (BrokenPipeError, ConnectionError):  # killed while it was idle
+                _bury(lane)
+                continue
+            self._busy[lane.connection] = (lane, key)
+            return
+
+    def wait(self) -> list[tuple[K, Any]]:
+        """Wait until a call ends; return key and answer of all that have ended, Died for those whose process died.
+
+        An error that a call raises is raised here.
+        """
+        answers = []
+        for connection in wait(list(self._busy)):
+            lane, key = self._busy.pop(connection)  # type: ignore[call-overload]
+            try:
+                answer = lane.connection.recv()
+            except (EOFError, OSError):
+                answer = _bury(lane)
+            else:
+                self._idle.append(lane)
+            if isinstance(answer, _Raised):
+                raise answer.error from RemoteTracebackError(answer.trace)
+            answers.append((key, answer))
+        return answers
+
+
+def _open_lane() -> _Lane:
+    ours, theirs = _SPAWN.Pipe()
+    process = _SPAWN.Process(target=_serve, args=(theirs,))
+    process.start()
+    theirs.close()  # or the end of a killed process would not be noticed
+    return _Lane(process, ours)
+
+
+def _bury(lane: _Lane) -> Died:
+    lane.connection.close()
+    lane.process.join(_LEAVING_SECONDS)
+    if lane.process.is_alive():
+        lane.process.kill()
+        lane.process.join()
+    return Died(lane.process.exitcode)
+
+
+def _serve(connection: Connection) -> None:
+    """Answer calls until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    os.environ.update(dict.fromkeys(_BLAS_VARIABLES, "1"))  # for libraries that the first call loads
+    while True:
+        try:
+            function, arguments = connection.recv()
+        except (EOFError, OSError):
+            return
+        threadpool_limits(limits=1)  # for those that are loaded
+        try:
+            answer = function(*arguments)
+        except BaseException as error:  # noqa: BLE001 - raised again in the parent
+            answer = _Raised(error, "".join(traceback.format_exception(error)))
+        try:
+            connection.send(answer)
+        except (BrokenPipeError, ConnectionError):
+            return
+
+
+def _end_with_parent() -> None:
+    """Leave when the parent is killed, also in the middle of a call."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

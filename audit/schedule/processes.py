@@ -1,0 +1,66 @@
+"""How are models audited in processes of this machine? Large ones over several, small ones whole, largest first."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from typing import Final
+
+from audit.schedule.lanes import Died, Lanes, ProcessDiedError
+from audit.schedule.task import AuditFunction, Outcome, Task, died_twice
+
+BYTES_WORTH_A_PROCESS: Final = 50_000_000  # of input: about a second of work, which is what a process costs
+
+
+def in_processes(plan: Sequence[Task], jobs: int, audit: AuditFunction) -> Generator[tuple[Task, Outcome]]:
+    """Yield outcomes as they come, from at most ``jobs`` processes at work; ``plan`` as `planned` makes it.
+
+    A model whose process dies is tried once more, in one process, when all others are finished; the other models do not
+    notice.
+    """
+    waiting = deque(plan)
+    again: list[Task] = []
+    ended: list[tuple[Task, Outcome]] = []
+    num_at_work = 0
+    with Lanes[Task]() as lanes:
+        while waiting or lanes.num_busy:
+            while waiting and num_at_work + waiting[0].num_processes <= jobs:
+                task = waiting.popleft()
+                num_at_work += task.num_processes
+                lanes.start(task, _call, audit, task)
+            yield from ended  # what the caller does with them is done while the processes work on
+            ended = []
+            for task, answer in lanes.wait():
+                num_at_work -= task.num_processes
+                if isinstance(answer, Died):
+                    again.append(replace(task, num_processes=1))
+                else:
+                    ended.append((task, answer))
+        yield from ended
+        for task in again:
+            lanes.start(task, _call, audit, task)
+            ((_, answer),) = lanes.wait()
+            yield task, died_twice(task, str(answer)) if isinstance(answer, Died) else answer
+
+
+def planned(tasks: Sequence[Task], jobs: int) -> list[Task]:
+    """Return the tasks, largest input first, each with its share of the processes, at least one.
+
+    A model gets several where it is more than one process's share of the whole work, and large enough that starting
+    them pays: otherwise whole models side by side keep all processes busy and share nothing.
+    """
+    total = max(1, sum(task.ref.num_bytes for task in tasks))
+
+    def share(task: Task) -> int:
+        return max(1, min(jobs * task.ref.num_bytes // total, task.ref.num_bytes // BYTES_WORTH_A_PROCESS))
+
+    ordered = sorted(tasks, key=lambda task: -task.ref.num_bytes)
+    return [replace(task, num_processes=share(task)) for task in ordered]
+
+
+def _call(audit: AuditFunction, task: Task) -> Outcome | Died:
+    try:
+        return audit(task)
+    except ProcessDiedError:  # one of those over which the images were spread
+        return Died(None)

@@ -1,0 +1,116 @@
+"""One model of a run: what is asked, what comes of it, and how it is loaded and audited, wherever that happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from audit.config import AuditConfig
+from audit.engine import audit_model
+from audit.schedule.images import image_processes
+from audit.table import ModelLabels
+from loaders import LoadError, MalformedFileError, MissingFileError, ModelRef, SparseModel, open_model
+from loaders.arrays import FloatArray
+from loaders.colmap_database import find_database, read_keypoint_shapes
+from loaders.input_state import InputState, read_input_state
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A model that could not be audited: its location as given, and one line that says why."""
+
+    location: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One model to audit.
+
+    known_digest: of the input it was last audited with; None when there is no such audit.
+    observations: whether to make the table of observations too.
+    num_processes: over which its images are spread.
+    """
+
+    ref: ModelRef
+    config: AuditConfig
+    known_digest: str | None
+    observations: bool = False
+    num_processes: int = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Audited:
+    """The tables of one model (by name), the input they were made from, and how long it took."""
+
+    state: InputState
+    tables: Mapping[str, pa.Table]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unchanged:
+    """The files were touched, their content is what it was: the finished tables hold."""
+
+
+Outcome = Audited | Unchanged | Failure
+AuditFunction = Callable[[Task], Outcome]
+
+
+def audit_one(task: Task) -> Outcome:
+    """Load and audit one model; a model that cannot be read is a Failure, any other error is raised."""
+    start = time.perf_counter()
+    ref = task.ref
+    with image_processes(task.num_processes) as spread:  # they start while the model is read
+        try:
+            state = read_input_state(ref.location)
+            if state.digest == task.known_digest:
+                return Unchanged()
+            model = open_model(ref.location)
+            scale_px = _keypoint_scales(ref, model) if task.config.noise == "keypoint" else None
+        except LoadError as error:
+            return Failure(ref.model_path, str(error))
+        labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
+        try:
+            audited = audit_model(model, task.config, labels, scale_px, observations=task.observations, spread=spread)
+        except BaseException as error:
+            error.add_note(f"while auditing {ref.model_path}")
+            raise
+    return Audited(state, audited.tables, time.perf_counter() - start)
+
+
+def too_large(ref: ModelRef, max_bytes: int) -> Failure:
+    """Return the failure of a model that is not loaded because of its size."""
+    got, limit = f"{ref.num_bytes / 1e9:.3g} GB of files", f"at most {max_bytes / 1e9:.3g} GB"
+    advice = "raise --max-model-gb where there is memory for it"
+    return Failure(ref.model_path, f"{ref.model_path}: expected {limit}, found {got}; {advice}")
+
+
+def died_twice(task: Task, how: str) -> Failure:
+    """Return the failure of a model whose process died a second time."""
+    path = task.ref.model_path
+    what = f"the process that audited it died twice, the second time with no other beside it ({how})"
+    return Failure(path, f"{path}: {what}; memory may be short (see dmesg), run it again where there is more")
+
+
+def _keypoint_scales(ref: ModelRef, model: SparseModel) -> FloatArray:
+    """Sizes of the model's keypoints, px, from the database.db beside or above it."""
+    database = find_database(ref.location)
+    if database is None:
+        raise MissingFileError(
+            ref.model_path,
+            None,
+            "a database.db beside the model or up to three folders above it, for --noise keypoint",
+            "none",
+            "put it there, or use --noise track",
+        )
+    scale_px = read_keypoint_shapes(database, model).scale_px
+    if scale_px.size and np.isnan(scale_px).all():
+        raise MalformedFileError(
+            str(database), None, "keypoints with a scale", "positions only", "use --noise track with these features"
+        )
+    return scale_px

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from run_samples import sample_table
+
+from audit.verdict import ReasonCode
+from reports.explain import LIMITS, REASON_CODES, Story, plain_reason, render_story, strongest_where
+
+SIZE = (1600.0, 1200.0)
+
+
+def row(**changes):
+    table = sample_table(
+        "images", 1, image_name=["IMG_1.jpg"], camera_model=["SIMPLE_RADIAL"], params=[[800.0, 320.0, 240.0, 0.1]]
+    )
+    base = {"advised_camera_model": None, "kurtosis_excess": 0.0, "scale_ratio": 1.0, "misfit_group": None}
+    return {**table.to_pylist()[0], **base, **changes}
+
+
+def test_every_reason_of_the_audit_has_words():
+    assert {str(code) for code in ReasonCode} == REASON_CODES
+
+
+def test_a_bent_lens_in_plain_words():
+    said = plain_reason(
+        "misfit_radial: 0.42 px, q = 1e-05", row(advised_camera_model="RADIAL"), where="strongest in the corners"
+    )
+    size = "0.42 px RMS, strongest in the corners (q = 1e-05)"
+    assert said == f"the lens bends more than k1 can say: {size}; RADIAL would hold it"
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("RADIAL", "more than k1 and k2 can say"),
+        ("FULL_OPENCV", "more than k1, k2, k3, k4, k5 and k6 can say"),
+        ("SIMPLE_PINHOLE", "and SIMPLE_PINHOLE has no word for it"),
+        ("FOV", "more than omega can say"),
+    ],
+)
+def test_the_camera_s_own_words_for_distortion(model, words):
+    assert words in plain_reason("misfit_radial: 0.42 px, q = 1e-05", row(camera_model=model))
+
+
+@pytest.mark.parametrize("code", sorted(REASON_CODES))
+def test_every_sentence_keeps_the_numbers(code):
+    detail = "0.42 px, q = 1e-05 (also smooth 0.40 px)" if code.startswith("misfit_") else "17 of 42"
+    said = plain_reason(f"{code}: {detail}", row(camera_model=None))
+    number = "0.42 px" if code.startswith("misfit_") else "17 of 42"
+    assert number in said or code == "distortion_folds"
+    assert "{" not in said
+
+
+def test_an_unknown_code_stays_as_it_is():
+    assert plain_reason("of_a_later_version: 3 <b>\n", row()) == "of_a_later_version: 3 <b>\\n"
+
+
+def test_heavy_tails_are_named():
+    said = plain_reason("ks_rejected: p = 0.01", row(kurtosis_excess=2.5, scale_ratio=3.0))
+    assert "excess kurtosis 2.5" in said
+    assert "3 times the variance" in said
+
+
+@pytest.mark.parametrize(
+    ("weight", "expected"),
+    [
+        (lambda x, y: (x**2 + y**2) ** 2, "strongest in the corners"),
+        (lambda x, y: np.exp(-8 * (x**2 + y**2)), "strongest in the centre"),
+        (lambda x, y: np.where(np.abs(x) > 0.8, 1.0, 0.0) * (np.abs(y) < 0.5), "strongest at the left and right edges"),
+        (lambda x, _: np.ones_like(x), None),
+    ],
+)
+def test_where_a_field_is_strongest(weight, expected):
+    share = np.random.default_rng(0).uniform(-1, 1, (4000, 2))
+    field = weight(*share.T)[:, None] * [1.0, 0.0]
+    assert strongest_where((share + 1) / 2 * SIZE, field, SIZE) == expected
+
+
+def test_the_story_fits_its_width_and_ends_with_what_it_does_not_prove():
+    reasons = ["misfit_radial: 0.42 px, q = 1e-05", "k1_not_identified: 0.1, sd = 0.2"]
+    given = row(reasons=reasons, verdict="rejected", verdict_misfit="rejected", image_name="a\nb" + "x" * 300)
+    text = render_story(
+        Story(given, {"policy": "full", "min_effect": "0.2px"}, "/data/m", None, {"01.png": "What it shows."})
+    )
+    assert "REJECTED under the policy full" in text
+    assert "a\\nbxxx" in text
+    assert text.index("Why") < text.index("Remarks (decide nothing)") < text.index("What a verdict does not prove")
+    assert all(len(line) <= 100 for line in text.splitlines() if "xxx" not in line)
+    assert LIMITS[-1] in text

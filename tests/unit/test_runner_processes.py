@@ -1,0 +1,181 @@
+"""Where models are audited must not be seen in the tables: processes, shares of them, and the images of one model."""
+
+import os
+import signal
+import tempfile
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import audit_stubs
+import numpy as np
+import pytest
+import threadpoolctl
+from corpus import parametrize_models
+from run_samples import make_ref, wait_for, write_models
+
+from audit.config import AuditConfig
+from audit.engine import ModelAuditor, audit_model
+from audit.schedule.images import image_processes, read_shared, write_shared
+from audit.schedule.lanes import Died, Lanes, RemoteTracebackError
+from audit.schedule.processes import BYTES_WORTH_A_PROCESS, in_processes, planned
+from audit.schedule.task import Audited, Failure, Task, audit_one
+from audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
+from loaders import discover, open_model
+
+GB = 1_000_000_000
+CONFIG = AuditConfig()
+
+
+def tasks_of(sizes):
+    return [Task(replace(make_ref(f"data/{i}"), num_bytes=size), CONFIG, None) for i, size in enumerate(sizes)]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "jobs", "shares"),
+    [
+        ((GB,), 4, [4]),  # alone: all processes
+        ((GB, GB), 4, [2, 2]),
+        ((GB,) * 4, 4, [1, 1, 1, 1]),
+        ((GB,) * 5, 4, [1, 1, 1, 1, 1]),
+        ((GB, 8 * GB, GB), 5, [4, 1, 1]),  # the largest first
+        ((1000,), 4, [1]),  # not worth a process
+        ((2 * BYTES_WORTH_A_PROCESS,), 16, [2]),
+        ((0, 0), 2, [1, 1]),
+    ],
+)
+def test_a_model_gets_its_share_of_the_processes(sizes, jobs, shares):
+    plan = planned(tasks_of(sizes), jobs)
+    assert [task.num_processes for task in plan] == shares
+    assert [task.ref.num_bytes for task in plan] == sorted(sizes, reverse=True)
+    assert sum(share for share in shares if share > 1) <= jobs
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Thirty images, some of them wrong, so that peeling has something to do."""
+    root = tmp_path_factory.mktemp("scene")
+    write_dataset(root, DatasetSpec(1, 30, linked=(250, 250), keypoints=300, defects=0.1), 1)
+    return scene_folder(root, 0)
+
+
+def audited(location, spread=None, **config):
+    options = {"spread": spread} if spread else {}
+    return audit_model(open_model(location), AuditConfig(**config), observations=True, **options).tables
+
+
+def check_spread_changes_nothing(location, num_processes, **config):
+    alone = audited(location, **config)
+    with image_processes(num_processes) as spread:
+        together = audited(location, spread, **config)
+    assert alone.keys() == together.keys()
+    for name, table in alone.items():
+        assert table.equals(together[name]), name
+
+
+@pytest.mark.parametrize("noise", ["track", "constant"])
+def test_images_spread_over_processes_give_the_same_bits(scene, noise):
+    check_spread_changes_nothing(scene, 3, noise=noise)
+
+
+@parametrize_models()
+def test_models_of_the_corpus_spread_over_processes_give_the_same_bits(model_dir):
+    if os.environ.get("SFM_AUDIT_SPREAD_CORPUS") is None and model_dir.name not in {"0", "south-building"}:
+        pytest.skip("SFM_AUDIT_SPREAD_CORPUS=1 spreads every model of the corpus")
+    check_spread_changes_nothing(model_dir, 2)
+
+
+def test_a_large_model_is_spread_by_the_runner_and_gives_the_same_bits(scene):
+    (ref,) = discover([scene]).refs
+    task = Task(replace(ref, num_bytes=GB), CONFIG, None)
+    (plan,) = planned([task], 2)
+    assert plan.num_processes == 2
+    ((_, outcome),) = in_processes([plan], 2, audit_one)
+    expected = audit_one(task)
+    assert isinstance(outcome, Audited)
+    assert all(outcome.tables[name].equals(table) for name, table in expected.tables.items())
+
+
+def test_a_model_one_of_whose_image_processes_dies_is_audited_again_in_one(scene, tmp_path):
+    (ref,) = discover([scene]).refs
+    task = Task(replace(ref, scene="deadly"), CONFIG, None, num_processes=2)
+    mark = tmp_path / "died"
+    ((_, outcome),) = in_processes([task], 2, partial(audit_stubs.lose_an_image_process, mark=mark))
+    assert mark.exists()
+    assert isinstance(outcome, Audited)
+
+
+def test_without_room_for_the_shared_file_the_images_are_audited_in_turn(scene, monkeypatch):
+    def full(*_: object):
+        raise OSError(28, "No space left on device")
+
+    with image_processes(2) as spread:
+        monkeypatch.setattr("audit.schedule.images.write_shared", full)
+        assert audited(scene, spread)["images"].equals(audited(scene)["images"])
+
+
+def test_an_auditor_travels_without_its_processes(scene):
+    auditor = ModelAuditor(open_model(scene), spread=lambda *_: pytest.fail("not here"))
+    with tempfile.TemporaryFile() as file:
+        write_shared(auditor, file)
+        copy = read_shared(file)
+    assert np.array_equal(copy.model.points.xyz_world, auditor.model.points.xyz_world)
+    assert not copy.model.points.xyz_world.flags.writeable
+    assert copy.image(0).verdict == ModelAuditor(open_model(scene)).image(0).verdict
+
+
+def test_a_call_runs_elsewhere_with_one_blas_thread_and_its_error_comes_back():
+    with Lanes() as lanes:
+        lanes.start("threads", threadpoolctl.threadpool_info)
+        ((key, pools),) = lanes.wait()
+        assert key == "threads"
+        assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} <= {1}
+        lanes.start("pid", os.getpid)
+        ((_, pid),) = lanes.wait()
+        assert pid != os.getpid()
+        lanes.start("error", int, "x")
+        with pytest.raises(ValueError, match="invalid literal") as caught:
+            lanes.wait()
+        assert isinstance(caught.value.__cause__, RemoteTracebackError)
+        assert "Traceback" in str(caught.value.__cause__)
+
+
+def test_the_death_of_a_process_costs_its_own_call_alone():
+    with Lanes() as lanes:
+        lanes.start("victim", signal.pause)
+        lanes.start("other", os.getpid)
+        ((key, other),) = lanes.wait()
+        assert key == "other"
+        (victim,) = [lane.process.pid for lane, _ in lanes._busy.values()]
+        os.kill(victim, signal.SIGKILL)
+        ((key, answer),) = lanes.wait()
+        assert (key, answer, str(answer)) == ("victim", Died(-9), "killed by SIGKILL")
+        os.kill(other, signal.SIGKILL)  # while it is idle
+        wait_for(lambda: not lanes._idle[0].process.is_alive())
+        lanes.start("again", os.getpid)
+        ((_, again),) = lanes.wait()
+        assert again not in {other, victim}
+
+
+def test_an_answer_that_is_half_written_is_a_death_and_not_a_wait():
+    with Lanes() as lanes:
+        lanes.start("half", audit_stubs.send_half_an_answer)
+        assert lanes.wait() == [("half", Died(-9))]
+
+
+def test_an_error_in_the_caller_ends_the_processes_at_once():
+    with pytest.raises(ZeroDivisionError), Lanes() as lanes:  # noqa: PT012
+        lanes.start("long", signal.pause)
+        (process,) = [lane.process for lane, _ in lanes._busy.values()]
+        raise ZeroDivisionError
+    assert not process.is_alive()
+
+
+def test_a_model_whose_process_dies_twice_says_how(tmp_path):
+    write_models(tmp_path / "data", ["deadly"])
+    (ref,) = discover([tmp_path / "data"]).refs
+    ((_, outcome),) = in_processes([Task(ref, CONFIG, None)], 2, audit_stubs.die)
+    assert isinstance(outcome, Failure)
+    assert "died twice" in outcome.message
+    assert "(exit code 9)" in outcome.message
+    assert Path(ref.location).exists()
