@@ -17,6 +17,7 @@ from reports.reader import Row
 from reports.wording import paragraph, shorten
 
 ASCII_HEAD: Final = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)
+_MIN_NAME: Final = 12
 _UNLIMITED: Final = 10_000  # rich never cuts: widths are decided here
 
 
@@ -31,12 +32,13 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One column of a printed table."""
+    """One column of a printed table. optional: left out where names would have to be shortened for it."""
 
     title: str
     show: Callable[[Row], str]
     style: Callable[[Row], str] = lambda _: ""
     numeric: bool = True
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +53,12 @@ class Listing:
 
 def draw(listing: Listing, fields: Sequence[Field], page: Page) -> str:
     """Draw a table whose first column, of names, takes what the others leave."""
+    widths = [_width(field, listing.rows) for field in fields]
+    wanted = max((cell_len(" ".join(name)) for name in listing.names), default=0)
+    if any(field.optional for field in fields) and wanted + sum(widths) > page.width:
+        return draw(listing, [field for field in fields if not field.optional], page)
     cells = [[field.show(row) for field in fields] for row in listing.rows]
-    widths = [max(len(part) for part in field.title.split("\n")) for field in fields]
-    widths = [max(width, *(len(row[i]) for row in cells)) for i, width in enumerate(widths)]
-    names = [_fit(name, max(12, page.width - sum(width + 1 for width in widths))) for name in listing.names]
+    names = [_fit(name, max(_MIN_NAME, page.width - sum(widths))) for name in listing.names]
     table = Table(box=box.SIMPLE_HEAD if page.unicode else ASCII_HEAD, padding=0, pad_edge=False, show_edge=False)
     table.add_column(listing.first, no_wrap=True, vertical="bottom")
     for field in fields:
@@ -67,6 +71,11 @@ def draw(listing: Listing, fields: Sequence[Field], page: Page) -> str:
     return "\n".join(
         [paragraph(listing.title, page.width), *(line.rstrip() for line in drawn.getvalue().splitlines()), ""]
     )
+
+
+def _width(field: Field, rows: Sequence[Row]) -> int:
+    """Cells that a column takes, the space before it included."""
+    return 1 + max(*map(len, field.title.split("\n")), *(len(field.show(row)) for row in rows), 0)
 
 
 def _fit(name: Sequence[str], width: int) -> str:

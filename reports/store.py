@@ -22,13 +22,16 @@ from filelock import FileLock, Timeout
 
 from loaders.discover import ModelRef
 from loaders.input_state import InputState
+from loaders.locations import real_location
 from reports.errors import OutputError, RunFolderError
 
 TOOL: Final = "sfm-audit"
-TABLES: Final = ("images", "models")  # in the order in which a model's parts are written
+TABLES: Final = ("images", "cameras", "models")  # in the order in which a model's parts are written
 METADATA_KEY: Final = b"sfm_audit"
 COUNTED: Final = ("num_images", "num_accepted", "num_rejected", "num_undetermined")
-_OWN_FILES: Final = frozenset({"run.json", ".lock", *TABLES})
+OBSERVATIONS: Final = "observations"  # only where it was asked for; written first
+_ALL_TABLES: Final = (OBSERVATIONS, *TABLES)
+_OWN_FILES: Final = frozenset({"run.json", ".lock", *_ALL_TABLES})
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +39,14 @@ class RunSettings:
     """What a run folder is bound to: the tool's version, the config, and the PATHs of the command.
 
     empty_paths: those of ``paths`` in which no model was found; a folder is not bound to them.
+    observations: whether a model is finished only with its table of observations.
     """
 
     version: str
     config: Mapping[str, Any]
     paths: Sequence[str]
     empty_paths: frozenset[str] = frozenset()
+    observations: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,34 @@ class _Part:
     seconds: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What run.json says about a finished model; all that is kept of it in memory, for a run may have 100,000."""
+
+    labels: Mapping[str, str]
+    num_bytes: int
+    digest: str
+    counts: tuple[int, ...]
+    seconds: float
+
+    @classmethod
+    def of(cls, part: _Part, ref: ModelRef) -> _Entry:
+        """Keep what is needed of a part."""
+        counts = tuple(part.counts[name] for name in COUNTED)
+        return cls(_labels(ref), part.state.num_bytes, part.state.digest, counts, part.seconds)
+
+    def line(self, key: str) -> bytes:
+        """Return the model's line among the inputs of run.json."""
+        fields = {
+            **self.labels,
+            "part": f"part-{key}.parquet",
+            "num_bytes": self.num_bytes,
+            "sha256": self.digest,
+            "seconds": round(self.seconds, 3),
+        }
+        return json.dumps(fields).encode()
+
+
 class RunStore:
     """An open run folder; one process at a time.
 
@@ -67,7 +100,7 @@ class RunStore:
         self.folder = folder
         self._settings = settings
         self._paths: list[dict[str, str]] = []
-        self._parts: dict[str, _Part] = {}
+        self._entries: dict[str, _Entry] = {}
         self._lock = FileLock(folder / ".lock", timeout=0)
 
     def __enter__(self) -> Self:
@@ -82,7 +115,7 @@ class RunStore:
         """
         _refuse_foreign_folder(self.folder)
         with _writing(self.folder):
-            for name in TABLES:
+            for name in self._wanted:
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
         self._acquire()
         try:
@@ -100,14 +133,22 @@ class RunStore:
         """Let other runs in; what was written stays."""
         self._lock.release()
 
+    def refuse_to_forget(self, left_out: Iterable[ModelRef]) -> None:
+        """Raise RunFolderError where the folder holds one of the models that a command leaves out."""
+        for ref in left_out:
+            if self._path("models", ref.key).exists():
+                problem = f"holds {ref.scene}/{ref.component} ({ref.model_path}), which this command leaves out"
+                advice = "choose that one too, choose another -o, or remove the folder"
+                raise RunFolderError(self.folder, problem, advice)
+
     def finished(self, ref: ModelRef) -> InputState | None:
         """Return the input a model was finished with, or None when this run has to audit it."""
         part = _read_part(self._path("models", ref.key))
-        if part is None or not self._path("images", ref.key).exists():
+        if part is None or not all(self._path(name, ref.key).exists() for name in self._wanted):
             return None
         if (part.version, part.config, part.labels) != (self._settings.version, self._config(), _labels(ref)):
             return None
-        self._parts[ref.key] = part
+        self._entries[ref.key] = _Entry.of(part, ref)
         return part.state
 
     def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
@@ -117,19 +158,21 @@ class RunStore:
         counts = {name: int(row[name][0].as_py()) for name in COUNTED}
         part = _Part(self._settings.version, self._config(), _labels(ref), state, counts, seconds)
         metadata = {METADATA_KEY: json.dumps(asdict(part)).encode()}
-        for name in TABLES:
+        for name in self._wanted:
             buffer = pa.BufferOutputStream()
             pq.write_table(tables[name].replace_schema_metadata(metadata), buffer)
-            _write_atomically(self._path(name, ref.key), buffer.getvalue().to_pybytes())
-        self._parts[ref.key] = part
+            _write_atomically(self._path(name, ref.key), [buffer.getvalue()])
+        self._entries[ref.key] = _Entry.of(part, ref)
 
     def drop(self, key: str) -> None:
         """Remove a model's parts, its mark of being finished first."""
-        self._parts.pop(key, None)
-        for name in reversed(TABLES):
+        self._entries.pop(key, None)
+        for name in reversed(_ALL_TABLES):
             path = self._path(name, key)
             with _writing(path):
-                path.unlink(missing_ok=True)
+                if path.exists():
+                    path.unlink()
+                    _flush_folder(path.parent)  # no later part may reach the disk before the mark is gone from it
 
     def finish(self, keep: Iterable[str] | None, failures: Sequence[tuple[str, str]], seconds: float) -> None:
         """Complete run.json, after removing all models but those in ``keep`` (None: remove nothing).
@@ -142,23 +185,20 @@ class RunStore:
                 key = path.stem.removeprefix("part-")
                 if key not in wanted:
                     self.drop(key)
-        totals = {name: sum(part.counts[name] for part in self._parts.values()) for name in COUNTED}
+        entries = self._entries
+        totals = {name: sum(entry.counts[i] for entry in entries.values()) for i, name in enumerate(COUNTED)}
         content = {
-            "counts": {"num_models": len(self._parts), **totals, "num_failures": len(failures)},
+            "counts": {"num_models": len(entries), **totals, "num_failures": len(failures)},
             "failures": [{"location": location, "message": message} for location, message in failures],
             "seconds": round(seconds, 3),
-            "inputs": [
-                {
-                    **part.labels,
-                    "part": f"part-{key}.parquet",
-                    "num_bytes": part.state.num_bytes,
-                    "sha256": part.state.digest,
-                    "seconds": round(part.seconds, 3),
-                }
-                for key, part in sorted(self._parts.items(), key=lambda item: item[1].labels["model_path"])
-            ],
         }
-        self._write_run_json("complete", content)
+        order = sorted(entries, key=lambda key: entries[key].labels["model_path"])
+        self._write_run_json("complete", content, (entries[key].line(key) for key in order))
+
+    @property
+    def _wanted(self) -> tuple[str, ...]:
+        """The tables of a finished model, in the order in which they are written."""
+        return _ALL_TABLES if self._settings.observations else TABLES
 
     def _path(self, table: str, key: str) -> Path:
         return self.folder / table / f"part-{key}.parquet"
@@ -182,7 +222,7 @@ class RunStore:
             if old["config"].get(name) != mine.get(name):
                 problem = f"holds a run with {name} = {old['config'].get(name)}, not {mine.get(name)}"
                 raise RunFolderError(self.folder, problem, "choose another -o, or remove the folder")
-        named = {os.path.realpath(path): path for path in self._settings.paths}
+        named = {real_location(path): path for path in self._settings.paths}
         bound = {path["real"]: path["given"] for path in old["paths"]}
         lost = [given for real, given in bound.items() if real not in named]
         if lost:
@@ -196,16 +236,16 @@ class RunStore:
 
     def _remove_temporary_files(self) -> None:
         with _writing(self.folder):
-            for folder in (self.folder, *(self.folder / name for name in TABLES)):
+            for folder in (self.folder, *(self.folder / name for name in _ALL_TABLES)):
                 for path in folder.glob(".tmp-*"):
                     path.unlink()
 
-    def _write_run_json(self, status: str, content: Mapping[str, Any]) -> None:
+    def _write_run_json(self, status: str, content: Mapping[str, Any], inputs: Iterable[bytes] | None = None) -> None:
         settings = self._settings
         head = {"tool": TOOL, "version": settings.version, "status": status}
         bound = {"config": self._config(), "paths": self._paths}
         text = json.dumps({**head, **bound, **content}, indent=1)
-        _write_atomically(self.folder / "run.json", text.encode())
+        _write_atomically(self.folder / "run.json", _with_inputs(text.encode(), inputs))
 
 
 def _labels(ref: ModelRef) -> dict[str, str]:
@@ -246,12 +286,26 @@ def _read_part(path: Path) -> _Part | None:
         return None
 
 
-def _write_atomically(path: Path, content: bytes) -> None:
+def _with_inputs(text: bytes, inputs: Iterable[bytes] | None) -> Iterator[bytes]:
+    """Yield a JSON object, and before its last brace the member ``inputs``, an element per line."""
+    if inputs is None:
+        yield text
+        return
+    yield text.removesuffix(b"\n}") + b',\n "inputs": ['
+    separator = b"\n  "
+    for line in inputs:
+        yield separator + line
+        separator = b",\n  "
+    yield b"\n ]\n}"
+
+
+def _write_atomically(path: Path, content: Iterable[bytes | pa.Buffer]) -> None:
     temporary = path.with_name(f".tmp-{path.name}")
     with _writing(path):
         try:
             with temporary.open("wb") as file:
-                file.write(content)
+                for piece in content:
+                    file.write(piece)
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)

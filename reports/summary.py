@@ -6,32 +6,54 @@ Nothing is computed here that the tables do not hold: rows are picked, ordered, 
 from __future__ import annotations
 
 import heapq
-from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any, Final
 
 from reports.drawing import Field, Listing, Page, draw
 from reports.reader import Row, RunReader
+from reports.reasons import reasons_part
 from reports.wording import MISSING, counted, natural_key, number, paragraph, plain, probability, px, shorten
 
+VERDICT_ORDER: Final = {"rejected": 0, "undetermined": 1, "accepted": 2}
+VERDICT_STYLE: Final = {"rejected": "red", "undetermined": "yellow", "accepted": "green"}
+VERDICTS: Final = {
+    "ks": ("verdict_ks", "is the noise what the noise model says?"),
+    "misfit": ("verdict_misfit", "does the camera model hold?"),
+    "pose": ("verdict_pose", "is the pose at its optimum?"),
+    "plausible": ("plausible", "is it a camera, and well observed?"),
+}
+POLICIES: Final = {
+    "paper": "verdict_ks alone",
+    "camera": "misfit, pose and plausible",
+    "full": "all four",
+}
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "num_accepted", "num_rejected", "num_undetermined"),
     *("stored_error_px", "recomputed_point_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
     "num_nonstationary_images",
+    *(f"num_{verdict}_{member}" for member in VERDICTS for verdict in VERDICT_ORDER),
 )
 IMAGE_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "image_name", "num_inliers", "rms_px", "sigma_predicted_px"),
-    *("sigma_constant_px", "noise_model", "ks_stat", "ks_p", "kurtosis_excess", "pose_offset_px", "verdict", "reasons"),
+    *("sigma_constant_px", "noise_model", "ks_stat", "ks_p", "misfit_group", "misfit_px", "pose_offset_px"),
+    *("coverage", "verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible"),
+)
+CAMERA_COLUMNS: Final = (
+    *("dataset", "scene", "component", "model_path", "camera_id", "camera_model", "num_images"),
+    *("misfit_group", "misfit_px", "misfit_material", "advised_camera_model"),
 )
 MAX_MODELS: Final = 40
 MAX_IMAGES_OF_ONE: Final = 25
 MAX_IMAGES_OF_MANY: Final = 12
-MAX_LINES: Final = 12  # of findings, of failures
-VERDICT_ORDER: Final = {"rejected": 0, "undetermined": 1, "accepted": 2}
-VERDICT_STYLE: Final = {"rejected": "red", "undetermined": "yellow", "accepted": "green"}
+MAX_LINES: Final = 12  # of cameras, of findings, of failures
+SHORT_GROUP: Final = {"principal_point": "principal", "rolling_shutter": "rolling"}
 STALE_SHARE: Final = 0.01
 CAVEATS: Final = (
-    "KS judges the noise, not the camera: a correct camera with odd noise can be rejected, and a wrong lens can pass.",
+    (
+        "KS judges the noise, misfit the camera: KS can reject a correct camera whose noise is odd, and accept a wrong "
+        "lens."
+    ),
     (
         "An accepted image agrees with its own reconstruction, which cannot see symmetric mis-registration, "
         "global scale or drift."
@@ -44,9 +66,11 @@ def render_summary(run: RunReader, page: Page) -> str:
     models = sorted(run.rows("models", MODEL_COLUMNS), key=_model_order)
     several = len({row["dataset"] for row in models}) > 1
     parts = [
-        _heading(run),
+        paragraph(_heading(run), page.width, "  "),
         *_models_part(models, page, several=several),
+        *_verdicts_part(run, models, page),
         *_images_part(run, models, page, several=several),
+        *_cameras_part(run, models, page, several=several),
     ]
     parts += [*_findings_part(models, page, several=several), *_failures_part(run, page), *_closing(run, models, page)]
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
@@ -54,8 +78,9 @@ def render_summary(run: RunReader, page: Page) -> str:
 
 def _heading(run: RunReader) -> str:
     config = run.info["config"]
-    settings = f"noise {config.get('noise')}, policy {config.get('policy')}, alpha {config.get('alpha')}"
-    return f"sfm-audit {run.info['version']}: {settings}"
+    settings = {"noise": "noise", "points": "points", "policy": "policy", "alpha": "alpha", "min_effect": "min effect"}
+    said = ", ".join(f"{words} {config.get(name)}" for name, words in settings.items())
+    return f"sfm-audit {run.info['version']}: {said}"
 
 
 def _models_part(models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
@@ -80,6 +105,27 @@ def _models_part(models: Sequence[Row], page: Page, *, several: bool) -> list[st
     return [draw(Listing(title, "model", names, shown), fields, page)]
 
 
+def _verdicts_part(run: RunReader, models: Sequence[Row], page: Page) -> list[str]:
+    """Count every verdict, and the policy's, over all images."""
+    if not models:
+        return []
+    policy = run.info["config"]["policy"]
+    asked = [(f"_{member}", column, question) for member, (column, question) in VERDICTS.items()]
+    asked.append(("", f"policy {policy}", POLICIES[policy]))
+    rows: list[Row] = [
+        {**{v: sum(row[f"num_{v}{suffix}"] for row in models) for v in VERDICT_ORDER}, "question": question}
+        for suffix, _, question in asked
+    ]
+    fields = [
+        Field("ac-\ncepted", lambda r: str(r["accepted"])),
+        Field("re-\njected", lambda r: str(r["rejected"]), lambda r: "red" if r["rejected"] else ""),
+        Field("unde-\ntermined", lambda r: str(r["undetermined"])),
+        Field("which asks", lambda r: r["question"], numeric=False),
+    ]
+    names = [[name] for _, name, _ in asked]
+    return [draw(Listing("Verdicts", "verdict", names, rows), fields, page)]
+
+
 def _images_part(run: RunReader, models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
     total = sum(row["num_images"] for row in models)
     if total == 0:
@@ -93,38 +139,36 @@ def _images_part(run: RunReader, models: Sequence[Row], page: Page, *, several: 
         Field(
             "verdict", lambda r: r["verdict"] or MISSING, lambda r: VERDICT_STYLE.get(r["verdict"], ""), numeric=False
         ),
-        Field("inliers", lambda r: str(r["num_inliers"])),
+        Field("in-\nliers", lambda r: str(r["num_inliers"])),
         Field("rms\npx", lambda r: px(r["rms_px"])),
         Field("noise\npx", lambda r: px(_noise_px(r))),
-        Field("KS\nD", lambda r: number(r["ks_stat"], 3)),
-        Field("KS\np", lambda r: probability(r["ks_p"])),
-        Field("kur-\ntosis", lambda r: number(r["kurtosis_excess"])),
-        Field("pose\npx", lambda r: number(r["pose_offset_px"]), _moved_style(run)),
+        Field("KS\np", lambda r: probability(r["ks_p"]), lambda r: VERDICT_STYLE.get(r["verdict_ks"], "")),
+        Field("misfit\npx", _misfit, lambda r: VERDICT_STYLE.get(r["verdict_misfit"], "")),
+        Field("pose\npx", lambda r: number(r["pose_offset_px"]), lambda r: VERDICT_STYLE.get(r["verdict_pose"], "")),
+        Field(
+            "cover-\nage",
+            lambda r: number(r["coverage"]),
+            lambda r: VERDICT_STYLE.get(r["plausible"], ""),
+            optional=True,
+        ),
     ]
-    text = draw(Listing(f"{title} (rejected first, largest KS distance first)", "image", names, rows), fields, page)
+    listing = Listing(f"{title} (rejected first, then by misfit, then by KS distance)", "image", names, rows)
+    text = draw(listing, fields, page)
     if len(rows) < total:
         text += f"... and {total - len(rows)} more, see {plain(str(run.folder))}/images\n"
-    return [text, *_reasons_part(run, page)]
+    return [text, *reasons_part(run, page.width)]
 
 
-def _reasons_part(run: RunReader, page: Page) -> list[str]:
-    """Count why images are not accepted, by reason code."""
-    counts: Counter[str] = Counter()
-    examples: dict[str, Row] = {}
-    for row in run.rows("images", ("image_name", "reasons")):
-        for reason in row["reasons"] or []:
-            code = reason.split(":", 1)[0]
-            counts[code] += 1
-            examples.setdefault(code, {"image": row["image_name"], "reason": reason})
+def _cameras_part(run: RunReader, models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
+    """List the cameras of several images that have, over all of them, a misfit that matters."""
+    found = [row for row in run.rows("cameras", CAMERA_COLUMNS) if row["num_images"] > 1 and row["misfit_material"]]
     lines = []
-    for code, count in counts.most_common():
-        example = examples[code]
-        detail = plain(example["reason"].partition(":")[2].strip())
-        name = shorten(plain(example["image"]), 30)
-        where = f"{name}: {detail}" if detail else name
-        lead = f"  {code}  {counted(count, 'image')}, "
-        lines.append(paragraph(lead + ("such as " if count > 1 else "") + where, page.width, "    "))
-    return ["\n".join(["Why images are not accepted", *lines])] if lines else []
+    for row in sorted(found, key=lambda row: (-row["misfit_px"], _model_order(row), row["camera_id"])):
+        where = "" if len(models) == 1 else f"{shorten(_model_name(row, several=several), 30)} "
+        what = f"{row['camera_model']}, {row['num_images']} images: {row['misfit_group']} {number(row['misfit_px'])} px"
+        advice = plain(row["advised_camera_model"] or "none")
+        lines.append(paragraph(f"  {where}camera {row['camera_id']}  {what}; advice: {advice}", page.width, "    "))
+    return _limited("Shared cameras that do not fit, all their images together", lines, "RUN/cameras")
 
 
 def _findings_part(models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
@@ -188,8 +232,9 @@ def _model_order(row: Row) -> Any:
 
 
 def _image_order(row: Row) -> Any:
-    distance = row["ks_stat"] if row["ks_stat"] is not None else 0.0
-    return (VERDICT_ORDER.get(row["verdict"], 1), -distance, _model_order(row), natural_key(row["image_name"]))
+    misfit, distance = (row[name] if row[name] is not None else 0.0 for name in ("misfit_px", "ks_stat"))
+    where = (_model_order(row), natural_key(row["image_name"]))
+    return (VERDICT_ORDER.get(row["verdict"], 1), -misfit, -distance, *where)
 
 
 def _model_name(row: Row, *, several: bool) -> str:
@@ -206,9 +251,9 @@ def _noise_px(row: Row) -> float | None:
     return None if value is None else float(value)
 
 
-def _moved_style(run: RunReader) -> Callable[[Row], str]:
-    limit = run.info["config"]["pose_offset_threshold_px"]
-    return lambda row: "red" if (row["pose_offset_px"] or 0) > limit else ""
+def _misfit(row: Row) -> str:
+    group = row["misfit_group"]
+    return MISSING if group is None else f"{SHORT_GROUP.get(group, group)} {number(row['misfit_px'])}"
 
 
 def _stale_style(row: Row) -> str:

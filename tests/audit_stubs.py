@@ -1,9 +1,14 @@
 """Stand-ins for audit.runner.audit_one that are slow, die or fail; worker processes import them by name."""
 
 import os
+import signal
+import stat
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
+from audit import engine
 from audit.runner import Outcome, Task, audit_one
 
 SECONDS = 0.4
@@ -42,3 +47,30 @@ def break_down(task: Task) -> Outcome:
     if task.ref.scene == "broken":
         raise ZeroDivisionError("a bug")
     return audit_one(task)
+
+
+def lose_an_image_process(task: Task, mark: Path) -> Outcome:
+    """Let one of the processes die over which the images are spread."""
+    facts_of = engine._facts_of
+    if task.num_processes > 1:
+        engine._facts_of = partial(_die_over_images, mark=mark)
+    try:
+        return audit_one(task)
+    finally:
+        engine._facts_of = facts_of
+
+
+def _die_over_images(_: object, image_idxs: range, mark: Path) -> list[None]:
+    if image_idxs.start == 0:
+        mark.touch()
+        os._exit(9)
+    return [None] * len(image_idxs)
+
+
+def send_half_an_answer() -> None:
+    """Begin to answer as Connection.send does, with the length of what follows, and be killed."""
+    for number in range(3, 64):
+        with suppress(OSError):
+            if stat.S_ISSOCK(os.fstat(number).st_mode):
+                os.write(number, (1000).to_bytes(4, "big") + b"half")
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -19,7 +20,14 @@ from loaders import ModelRef
 from loaders.input_state import InputState
 from reports.store import RunSettings
 
-CONFIG = {"noise": "track", "policy": "paper", "alpha": 0.05, "pose_offset_threshold_px": 0.5}
+CONFIG = {
+    "noise": "track",
+    "points": "in-sample",
+    "policy": "full",
+    "min_effect": "0.2px",
+    "alpha": 0.05,
+    "pose_offset_threshold_px": 0.5,
+}
 STATE = InputState(1000, "stamp", "digest")
 TESTS = Path(__file__).resolve().parent
 
@@ -47,20 +55,22 @@ def sample_table(name: str, num_rows: int, **given: Any) -> pa.Table:
     return build_table({**columns, **given}, wanted)
 
 
-def sample_tables(ref: ModelRef, verdicts=("accepted", "rejected"), models=None, **images: Any) -> dict[str, pa.Table]:
-    """Return both tables of one model with one image per verdict."""
+def sample_tables(
+    ref: ModelRef, verdicts=("accepted", "rejected"), models=None, cameras=None, **images: Any
+) -> dict[str, pa.Table]:
+    """Return the tables of one model with one image per verdict and one camera, which they share."""
     n = len(verdicts)
     labels = {name: getattr(ref, name) for name in ("dataset", "scene", "component", "model_path")}
     counts = {f"num_{verdict}": [verdicts.count(verdict)] for verdict in ("accepted", "rejected", "undetermined")}
     names = [f"IMG_{i:04d}.jpg" for i in range(n)]
     image_labels = {name: [value] * n for name, value in labels.items()}
+    one = {name: [value] for name, value in labels.items()}
     return {
         "images": sample_table(
             "images", n, **{**image_labels, "image_name": names, "verdict": list(verdicts), **images}
         ),
-        "models": sample_table(
-            "models", 1, num_images=[n], **counts, **{name: [value] for name, value in labels.items()}, **(models or {})
-        ),
+        "cameras": sample_table("cameras", 1, **{**one, "num_images": [n], **(cameras or {})}),
+        "models": sample_table("models", 1, num_images=[n], **counts, **one, **(models or {})),
     }
 
 
@@ -85,7 +95,11 @@ def truncate(file: Path) -> None:
 
 def read_run(run: Path) -> dict[str, pa.Table]:
     """Return the tables of a run, rows sorted by identity, without the metadata of parts."""
-    order = {"images": ("model_path", "image_id"), "models": ("model_path",)}
+    order = {
+        "images": ("model_path", "image_id"),
+        "cameras": ("model_path", "camera_id"),
+        "models": ("model_path",),
+    }
     tables = {}
     for name, keys in order.items():
         parts = [pq.ParquetFile(path).read() for path in sorted((run / name).glob("*.parquet"))]
@@ -106,9 +120,11 @@ def start_cli(*args: str | Path, stub: str | None = None, **options: Any) -> sub
         code += f"\nauditing.audit_many = functools.partial(auditing.audit_many, audit=audit_stubs.{stub})"
     code += "\nentry_point()"
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
+    # an interrupt must reach the child also where the tests run in the background, which ignores it
+    own_signals = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     command = [sys.executable, "-c", code, *map(str, args)]
-    return subprocess.Popen(command, text=True, env=env, **{**streams, **options})
+    return subprocess.Popen(command, text=True, env=env, **{**own_signals, **streams, **options})
 
 
 def run_cli(*args: str | Path, stub: str | None = None, **options: Any) -> tuple[int, str, str]:

@@ -5,7 +5,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from audit.cli.demo import NOT_REGISTERED, _compared, _why_not_found
 from audit.cli.main import main
+from audit.simulate.demo import TruthRecord
 
 
 @pytest.fixture(scope="module")
@@ -21,9 +23,16 @@ def demo(tmp_path_factory):
     return folder / "audit-demo", "\n".join(printed)
 
 
+ROW = re.compile(
+    r"^(?P<name>IMG_\d+\.jpg) (?P<planted>.*?) +(?P<verdict>accepted|rejected|undetermined) +(?P<found>yes|NO) "
+    r"(?P<because>.*?) +(?P<advice>\S+)$",
+    re.MULTILINE,
+)
+TOO_LITTLE = {"too_few_observations", "low_coverage", "few_occupied_cells"}
+
+
 def planted_rows(text: str) -> list[re.Match[str]]:
-    found = re.finditer(r"^(IMG_\d+\.jpg) (.*?) +(accepted|rejected|undetermined) +(yes|NO)$", text, re.MULTILINE)
-    return list(found)
+    return list(ROW.finditer(text[text.index("Planted defects against verdicts") :]))
 
 
 def test_the_demo_leaves_a_model_its_truth_and_a_run(demo):
@@ -40,15 +49,39 @@ def test_every_planted_defect_is_printed_with_what_the_tables_say(demo):
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["defects"]
     images = pd.read_parquet(folder / "run" / "images").set_index("image_name")
     rows = planted_rows(text)
-    assert sorted(row[1] for row in rows) == sorted(defect["image_name"] for defect in truth)
+    assert sorted(row["name"] for row in rows) == sorted(defect["image_name"] for defect in truth)
+    defects = {defect["image_name"]: defect["defect"] for defect in truth}
     for row in rows:
-        verdict, reasons = images.loc[row[1], ["verdict", "reasons"]]
-        assert row[3] == verdict
-        few = verdict == "undetermined" and any(reason.startswith("too_few_observations") for reason in reasons)
-        assert (row[4] == "yes") == (verdict == "rejected" or few)
-    num_found = sum(row[4] == "yes" for row in rows)
+        image = images.loc[row["name"]]
+        codes = {reason.split(":")[0] for reason in image["reasons"]}
+        assert row["verdict"] == image["verdict"]
+        few = image["verdict"] == "undetermined" and defects[row["name"]] == "few_points" and codes & TOO_LITTLE
+        assert (row["found"] == "yes") == bool(image["verdict"] == "rejected" or few)
+        if isinstance(image["misfit_group"], str):
+            assert row["because"] == f"{image['misfit_group']} {image['misfit_px']:.2f} px"
+            assert row["advice"] == image["advised_camera_model"]
+        else:
+            assert row["because"] in codes
+            assert row["advice"] == "-"
+    num_found = sum(row["found"] == "yes" for row in rows)
     assert f"{num_found} of {len(truth)} planted defects found." in text
-    assert 0 < num_found < len(truth), "the demo shows what is found and what is not"
+
+
+def test_the_planted_defects_are_found_for_what_they_are(demo):
+    folder, text = demo
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["defects"]
+    rows = {row["name"]: row for row in planted_rows(text)}
+    for defect in truth:
+        row = rows[defect["image_name"]]
+        assert row["found"] == "yes"
+        match defect["defect"]:
+            case "radial_k2":
+                assert row["because"].startswith("radial ")
+                assert row["advice"] == "RADIAL"
+            case "perturbed_pose":
+                assert row["because"] == "pose_not_optimal"
+            case _:
+                assert row["because"] in TOO_LITTLE
 
 
 def test_false_alarms_are_counted_among_the_sound_images(demo):
@@ -56,8 +89,46 @@ def test_false_alarms_are_counted_among_the_sound_images(demo):
     truth = {d["image_name"] for d in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["defects"]}
     images = pd.read_parquet(folder / "run" / "images")
     sound = images[~images["image_name"].isin(truth)]
-    alarms = (sound["verdict"] == "rejected").sum()
-    assert f"{alarms} of {len(sound)} sound images rejected (false alarms)." in text
+    by_camera = (sound[["verdict_misfit", "verdict_pose", "plausible"]] == "rejected").any(axis=1).sum()
+    full, paper = ((sound[name] == "rejected").sum() for name in ("verdict", "verdict_ks"))
+    said = f"{full} under policy full, {by_camera} camera, {paper} paper."
+    assert f"Of {len(sound)} sound images rejected (false alarms): {said}" in " ".join(text.split())
+    assert by_camera == 0
+
+
+def record(defect: str, size_px: float | None = 0.3) -> TruthRecord:
+    return TruthRecord("a.jpg", defect, size_px, "only 22 points, all in a corner")
+
+
+def image(verdict: str, *reasons: str, **changes: object) -> dict:
+    row = {"image_name": "a.jpg", "num_inliers": 350, "verdict": verdict, "reasons": list(reasons)}
+    judged = dict.fromkeys(("verdict_ks", "verdict_misfit", "verdict_pose", "plausible"), verdict)
+    return {**row, **judged, "misfit_group": None, "misfit_px": None, "advised_camera_model": None, **changes}
+
+
+@pytest.mark.parametrize(
+    ("defect", "row", "found", "why"),
+    [
+        ("radial_k2", image("rejected", "misfit_radial: 0.3 px", misfit_group="radial", misfit_px=0.3), True, ""),
+        ("radial_k2", image("undetermined", "low_coverage: 2 %"), False, "undetermined for another reason (low_cov"),
+        ("few_points", image("undetermined", "low_coverage: 2 %"), True, ""),
+        ("few_points", image("undetermined", "few_occupied_cells: 9 < 16"), True, ""),
+        ("few_points", image("undetermined", "noise_not_fitted: 22"), False, "(noise_not_fitted)"),
+        ("perturbed_pose", image("accepted", "k1_not_identified: 0.1"), False, "not significant in 350 inliers"),
+        (
+            "radial_k2",
+            image("accepted", misfit_group="radial", misfit_px=0.12),
+            False,
+            "radial 0.12 px is there, but below what matters (0.2px, --min-effect)",
+        ),
+        ("radial_k2", NOT_REGISTERED, False, "not registered"),
+    ],
+)
+def test_what_is_not_found_is_said_with_its_cause(defect, row, found, why):
+    compared = _compared(record(defect), row)
+    assert compared["found"] is found
+    if not found:
+        assert why in _why_not_found(compared, "0.2px")
 
 
 def test_every_printed_line_fits_80_columns(demo):

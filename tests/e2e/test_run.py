@@ -33,7 +33,7 @@ def data(source, tmp_path, monkeypatch):
 
 def same_rows(first: Path, second: Path) -> bool:
     one, two = read_run(first), read_run(second)
-    return all(one[name].equals(two[name]) for name in ("images", "models"))
+    return all(one[name].equals(two[name]) for name in ("images", "cameras", "models"))
 
 
 def parts(run: str, table: str = "models") -> list[Path]:
@@ -46,7 +46,9 @@ def test_a_run_writes_one_row_per_image_and_model(capsys):
     assert err == ""
     assert "4 models" in out
     images, models = pd.read_parquet("RUN/images"), pd.read_parquet("RUN/models")
+    cameras = pd.read_parquet("RUN/cameras")
     assert len(images) == 20
+    assert cameras.groupby("model_path")["num_images"].sum().tolist() == [5] * 4
     assert sorted(models["scene"]) == sorted(NAMES)
     assert set(models["dataset"]) == {"data"}
     assert set(models["component"]) == {"0"}
@@ -133,6 +135,73 @@ def test_config_file_and_options_reach_the_tables():
     assert set(pd.read_parquet("RUN2/images")["noise_model"]) == {"track"}
 
 
+def config_of(run: str) -> dict:
+    return json.loads(Path(run, "run.json").read_text(encoding="utf-8"))["config"]
+
+
+def test_min_effect_in_sigma_is_each_image_s_own():
+    """The noise is 0.5 px and the cameras are right: with a tau next to nothing, the significant ones alone decide."""
+    tables = {}
+    for tau in ("0.2px", "0.5sigma", "0.0001sigma"):
+        assert main(["run", "data", "-o", tau, "--min-effect", tau, "--quiet"]) == 0
+        assert config_of(tau)["min_effect"] == tau
+        tables[tau] = pd.read_parquet(f"{tau}/images")
+    for tau, frame in tables.items():
+        limit = 0.2 if tau == "0.2px" else float(tau.removesuffix("sigma")) * frame["sigma_constant_px"]
+        judged = frame["verdict_misfit"] != "undetermined"
+        expected = frame["misfit_px"].notna() & (frame["misfit_px"] > limit)
+        assert ((frame["verdict_misfit"] == "rejected") == (expected & judged)).all()
+
+
+def test_independent_points_are_not_whitened_and_nobody_is_blamed():
+    args = ("--points", "independent", "--noise", "constant")
+    assert main(["run", "data", "-o", "RUN", *args, "--quiet"]) == 0
+    assert {config_of("RUN")[name] for name in ("points", "noise")} == {"independent", "constant"}
+    images = pd.read_parquet("RUN/images")
+    assert set(images["noise_model"]) == {"constant"}
+    assert (images["num_unverifiable"] == 0).all()
+    assert images["verdict_misfit"].notna().all()
+    assert main(["run", "data", "-o", "OTHER", "--points", "independent"]) == 2
+
+
+@pytest.mark.parametrize("policy", ["paper", "camera", "full"])
+def test_a_policy_is_what_its_members_say(policy):
+    members = {"paper": ["verdict_ks"], "camera": ["verdict_misfit", "verdict_pose", "plausible"]}
+    members["full"] = [*members["paper"], *members["camera"]]
+    Path("audit.toml").write_text("alpha = 0.3\n", encoding="utf-8")  # a level at which something is rejected
+    assert main(["run", "data", "-o", "RUN", "--policy", policy, "--config", "audit.toml", "--quiet"]) == 0
+    images = pd.read_parquet("RUN/images")
+    for _, row in images.iterrows():
+        said = set(row[members[policy]])
+        wanted = next(verdict for verdict in ("rejected", "undetermined", "accepted") if verdict in said)
+        assert row["verdict"] == wanted
+        assert wanted == "accepted" or len(row["reasons"])
+
+
+def test_keypoint_noise_without_a_database_costs_one_line_and_3(capsys):
+    assert main(["run", "data/0001", "-o", "RUN", "--noise", "keypoint"]) == 3
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "data/0001/sparse/0" in err
+    assert "database.db" in err
+    assert "use --noise track" in err
+
+
+def test_keypoint_noise_on_real_models(corpus, capsys):
+    root = corpus / "megadepth_like" / "MegaDepth_v1_SfM"
+    for noise in ("keypoint", "track"):
+        assert main(["run", str(root), "-o", noise, "--noise", noise, "--jobs", "1"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert max(map(len, out.splitlines())) <= 80
+    keypoint, track = pd.read_parquet("keypoint/images"), pd.read_parquet("track/images")
+    assert set(keypoint["noise_model"]) == {"keypoint"}
+    assert sorted(keypoint["image_name"]) == sorted(track["image_name"])
+    same = ["scene", "component", "image_id", "num_inliers", "rms_px", "verdict_misfit", "verdict_pose", "plausible"]
+    pd.testing.assert_frame_equal(keypoint[same], track[same])
+    assert not keypoint["sigma_predicted_px"].equals(track["sigma_predicted_px"])
+
+
 @pytest.mark.parametrize("out", ["file", "file/RUN", "/proc/RUN"])
 def test_output_that_cannot_be_written_is_4(out, capsys):
     Path("file").touch()
@@ -175,7 +244,7 @@ def test_a_second_run_audits_only_what_changed(data):
     (data / "new/sparse/0").rmdir()
     assert main(["run", "data", "-o", "RUN", "--quiet"]) == 0
     changed = {name for name, time in part_times(Path("RUN")).items() if before[name] != time}
-    assert len(changed) == 2
+    assert len(changed) == 3
     assert main(["run", "data", "-o", "FRESH", "--quiet"]) == 0
     assert same_rows(Path("RUN"), Path("FRESH"))
 
@@ -254,7 +323,7 @@ def test_list_prints_the_models_and_audits_nothing(capsys):
     assert main(["run", "data", "--list"]) == 0
     rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
     assert [row[:3] for row in rows] == [["data", name, "0"] for name in sorted(NAMES)]
-    assert all(int(row[3]) > 1000 for row in rows)
+    assert all((int(row[3]), int(row[4]) > 1000) == (5, True) for row in rows)
     assert main(["run", "nothing", "--list"]) == 3
 
 

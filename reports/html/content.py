@@ -1,0 +1,152 @@
+"""What of a run stands on the page? Counts over all images, the worst rows, the cameras; read part by part."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from audit.table import TABLES
+from loaders.arrays import FloatArray
+from reports.explain import split_reason
+from reports.reader import Row, RunReader
+from reports.reasons import is_remark
+from reports.wording import natural_key
+
+MAX_ROWS: Final = 10_000  # of the image table
+MAX_SCENES: Final = 300
+MAX_CAMERAS: Final = 40
+VERDICTS: Final = ("accepted", "rejected", "undetermined")
+MEMBERS: Final = ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible")
+POLICIES: Final = {"full": MEMBERS, "camera": MEMBERS[1:], "paper": MEMBERS[:1]}
+DISTRIBUTIONS: Final = (
+    *("sigma_predicted_px", "sigma_constant_px", "kurtosis_excess", "kurtosis_constant", "misfit_px", "scale_ratio"),
+    *("ks_stat", "ks_constant_stat", "ks_p", "ks_constant_p"),
+)
+_RANK: Final = {"rejected": 0, "undetermined": 1, "accepted": 2}
+
+
+@dataclass(slots=True)
+class Reason:
+    """How many images have a reason, and the first of them."""
+
+    images: int
+    example: str
+    detail: str
+
+
+@dataclass(slots=True)
+class RunContent:
+    """A run, counted.
+
+    counts: question or policy -> verdict -> images.      scenes: (dataset, scene) -> verdict -> images.
+    reasons, remarks: by code; remarks decide nothing.    numbers: distributions' column -> one value per image.
+    verdicts: one per image.       rows: the worst MAX_ROWS images, the worst first, each with its ``part``.
+    cameras: the worst of ``num_cameras``.                models: all model rows.
+    """
+
+    run: RunReader
+    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    scenes: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    reasons: dict[str, Reason] = field(default_factory=dict)
+    remarks: dict[str, Reason] = field(default_factory=dict)
+    numbers: dict[str, FloatArray] = field(default_factory=dict)
+    verdicts: list[str] = field(default_factory=list)
+    noise_model: str | None = None
+    rows: list[Row] = field(default_factory=list)
+    cameras: list[Row] = field(default_factory=list)
+    num_cameras: int = 0
+    models: list[Row] = field(default_factory=list)
+
+    @property
+    def num_images(self) -> int:
+        """All images of the run, on the page or not."""
+        return len(self.verdicts)
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The settings of the run."""
+        config: Mapping[str, Any] = self.run.info["config"]
+        return config
+
+
+def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
+    """Read a run folder; memory grows with ``max_rows``, and by 100 bytes with every other image."""
+    content = RunContent(run)
+    columns = [column.name for column in TABLES["images"]]
+    chunks: dict[str, list[FloatArray]] = {name: [] for name in DISTRIBUTIONS}
+    worst: list[tuple[Any, int, Row]] = []
+    for part, rows in _parts(run, "images", columns):
+        for name, values in chunks.items():
+            values.append(np.array([math.nan if row[name] is None else row[name] for row in rows], dtype=np.float64))
+        for row in rows:
+            _count(content, row)
+            row["part"] = part
+        first = len(content.verdicts) - len(rows)
+        keyed = [(severity(row), first + i, row) for i, row in enumerate(rows)]
+        worst = heapq.nsmallest(max_rows, [*worst, *keyed]) if len(worst) + len(keyed) > max_rows else worst + keyed
+    content.rows = [row for _, _, row in sorted(worst)]
+    content.numbers = {name: np.concatenate([np.empty(0), *values]) for name, values in chunks.items()}
+    _read_cameras(content)
+    content.models = list(run.rows("models", [column.name for column in TABLES["models"]]))
+    return content
+
+
+def severity(row: Row) -> tuple[Any, ...]:
+    """Return a sort key: rejected first, then the largest misfit, then the largest KS distance, then by name."""
+    misfit, distance = (row[name] if row[name] is not None else 0.0 for name in ("misfit_px", "ks_stat"))
+    where = natural_key(row["scene"], row["component"], row["image_name"])
+    return (_RANK.get(row["verdict"], 1), -misfit, -distance, *where)
+
+
+def judged_under(row: Row, members: tuple[str, ...]) -> str:
+    """Return the verdict of a policy: rejected if a member rejects, else undetermined if one is, else accepted."""
+    return min((row[member] or "undetermined" for member in members), key=lambda verdict: _RANK.get(verdict, 1))
+
+
+def _count(content: RunContent, row: Row) -> None:
+    verdict = row["verdict"] or "undetermined"
+    content.verdicts.append(verdict)
+    content.noise_model = content.noise_model or row["noise_model"]
+    content.scenes[row["dataset"], row["scene"]][verdict] += 1
+    for policy, members in POLICIES.items():
+        content.counts[f"policy {policy}"][judged_under(row, members)] += 1
+    for member in MEMBERS:
+        content.counts[member][row[member] or "undetermined"] += 1
+    details: dict[str, str] = {}
+    for reason in row["reasons"] or []:
+        code, detail = split_reason(reason)
+        details.setdefault(code, detail)
+    for code, detail in details.items():
+        table = content.remarks if is_remark(code, row) else content.reasons
+        if code in table:
+            table[code].images += 1
+        else:
+            table[code] = Reason(1, row["image_name"], detail)
+
+
+def _read_cameras(content: RunContent) -> None:
+    columns = [column.name for column in TABLES["cameras"]]
+    worst: list[tuple[Any, int, Row]] = []
+    for _, rows in _parts(content.run, "cameras", columns):
+        keyed = [(_camera_severity(row), content.num_cameras + i, row) for i, row in enumerate(rows)]
+        content.num_cameras += len(rows)
+        worst = heapq.nsmallest(MAX_CAMERAS, [*worst, *keyed])
+    content.cameras = [row for _, _, row in sorted(worst)]
+
+
+def _camera_severity(row: Row) -> tuple[Any, ...]:
+    return (-(row["misfit_px"] or 0.0), -row["num_images"], natural_key(row["scene"], row["camera_id"]))
+
+
+def _parts(run: RunReader, table: str, columns: list[str]) -> Iterator[tuple[str, list[Row]]]:
+    """Yield the name and the rows of each part."""
+    for path in sorted((run.folder / table).glob("part-*.parquet")):
+        with pq.ParquetFile(path) as part:
+            yield path.name, part.read(columns=columns).to_pylist()
