@@ -1,4 +1,4 @@
-"""Write docs/tables.md and docs/config.md from the code; with --check, fail when they are not what would be written."""
+"""Write the pages of docs/ that are made from code; with --check, fail when they are not what would be written."""
 
 from __future__ import annotations
 
@@ -8,19 +8,27 @@ from pathlib import Path
 
 from audit.config import AuditConfig
 from audit.table import TABLES
+from audit.verdict import REASON_MEANINGS, ReasonCode
+from loaders.model import FINDING_MEANINGS, FindingCode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TABLES_INTRODUCTION = """# Tables
 
 Made from `audit/table.py` by `scripts/make_docs_tables.py`; do not edit.
 
-A run folder holds one Parquet file per model in `RUN/images` (one row per registered image) and in `RUN/models` (one
-row per model). `pandas.read_parquet(RUN + "/images")` reads all of them. A value that was not computed is null, never a
-number that stands for it. The unit and the meaning of a column are also in the files, as field metadata.
+A run folder holds one Parquet file per model in each of `RUN/images`, `RUN/cameras` and `RUN/models`, and with
+`--observations` in `RUN/observations`. `pandas.read_parquet(RUN + "/images")` reads all of them. A value that was not
+computed is null, never a number that stands for it. The unit and the meaning of a column are also in the files, as
+field metadata.
 """
 HEADERS = {
-    "images": "One row per registered image. METHOD.md names the quantities.",
-    "models": "One row per model.",
+    "images": "One row per registered image. method.md names the quantities; docs/verdicts.md explains the verdicts.",
+    "cameras": (
+        "One row per camera that has an image with inliers. The tests are pooled over all its images: poses profiled\n"
+        "per image, intrinsics once, clustered by track. A camera with one image has that image's tests."
+    ),
+    "observations": "One row per inlier of an image, only with `--observations`.",
+    "models": "One row per model. docs/findings.md explains the findings.",
 }
 CONFIG_INTRODUCTION = """# Settings
 
@@ -33,9 +41,108 @@ noise = "constant"
 alpha = 0.01
 ```
 
-What the file leaves out keeps its default; options of the command line come before the file. An unknown name or a value
-of the wrong kind is refused. A run folder holds the tables of one config: another one needs another folder.
+What the file leaves out keeps its default; options of the command line come before the file. An unknown name, a value
+of the wrong kind, or settings that contradict each other are refused. A run folder holds the tables of one config:
+another one needs another folder.
 """
+FINDINGS_PAGE = """# Findings
+
+Made from `loaders/model.py` by `scripts/make_docs_tables.py`; do not edit.
+
+A model that can be read is audited, however inconsistent it is; what is inconsistent stands in the column `findings` of
+`RUN/models`: a code, how many items it concerns, and one line for people. A model that cannot be read (a file is
+missing, cut short, or not what it says) has no findings: it is a failure in `run.json`, one line on stderr, and exit
+code 3.
+
+"""
+VERDICTS_PAGE = """# Verdicts
+
+Made from `audit/verdict.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
+
+Four verdicts judge an image, each by its own question. Each is `accepted`, `rejected`, or `undetermined` where the
+image does not say enough: undetermined is no pass.
+
+| column | question | rejected | undetermined |
+|---|---|---|---|
+| `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} | \
+fewer than {min_observations} standardised observations; no noise fitted |
+| `verdict_misfit` | Does the camera model hold? | after peeling, a group has q < {alpha} *and* an effect above \
+{min_effect} | fewer than {min_observations} observations of sound points; none of radial, tangential, affine, \
+principal_point could run |
+| `verdict_pose` | Is the pose at the optimum of the image's own residuals? | `pose_offset_px` > \
+{pose_offset_threshold_px} px | fewer than {min_observations} inliers |
+| `plausible` | Could this be a camera, and do the points say so? | focal length / longer side outside \
+[{min_focal_over_size}, {max_focal_over_size}]; the distortion folds inside the image; the principal point lies \
+outside | sd of f / f > {max_sd_focal_rel}; coverage < {min_coverage}; fewer than {min_occupied_cells} occupied cells; \
+fewer than {min_observations} inliers |
+
+The numbers are defaults (docs/config.md). q: Holm over the groups of an image, then Benjamini-Hochberg over the images
+of its model; nothing depends on other models. *Peeling*: shared points carry the field of a wrong image into its sound
+neighbours, so the images with the largest effects are set aside, the points triangulated from the others, and everybody
+is tested against these. Where more than half of the testable images are wrong, nobody is set aside; the verdicts then
+rest on the model as it stands, and a camera whose images together say so is named (`shared_camera`).
+
+## Policies
+
+`verdict` is what the policy of the run (`--policy`) makes of the four:
+
+| policy | decides |
+|---|---|
+| `full` (default) | all four |
+| `camera` | `verdict_misfit`, `verdict_pose`, `plausible`: the noise may have any distribution |
+| `paper` | `verdict_ks` alone |
+
+Rejected if any of them rejects; else undetermined if any of them is; else accepted.
+
+## Reasons
+
+`reasons` lists, for the verdicts of the policy, a code, a colon, and the number that triggered it. *Remarks* stand in
+the same list and decide nothing: an accepted image may carry them.
+
+{reasons}
+
+## What a verdict does not prove
+
+- KS judges the noise, misfit the camera. KS rejects a correct camera whose noise is not what the model of the noise
+  says, and with few observations it accepts a wrong lens.
+- An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration (a repeated facade
+  matched to the wrong copy), global scale, or drift.
+- A pose that was adjusted together with its error is at its optimum: `verdict_pose` finds poses that were changed, or
+  not adjusted, afterwards.
+- Effects below `--min-effect` are no reason to reject, however significant they are; in the tables they stand all the
+  same (`misfit_px`, `misfit_q`).
+- A group that the camera model has already, as radial in FULL_OPENCV, is null: it could not be tested, which is no
+  pass. Spherical cameras have no misfit test.
+- Standard deviations of camera parameters are conditional on the points, so they are lower bounds.
+- Accepted is no p-value: of correct images some are rejected too (docs/validation.md says how many).
+"""
+_ALL = "all four"
+REASON_EFFECTS = {
+    ReasonCode.KS_REJECTED: ("`verdict_ks`", "rejected"),
+    ReasonCode.TOO_FEW_OBSERVATIONS: (_ALL, "undetermined"),
+    ReasonCode.NON_FINITE_POSE: (_ALL, "undetermined"),
+    ReasonCode.NON_FINITE_CAMERA: (_ALL, "undetermined"),
+    ReasonCode.MISSING_CAMERA: (_ALL, "undetermined"),
+    ReasonCode.EXACT_PROJECTIONS: ("`verdict_ks`, `verdict_misfit`", "undetermined"),
+    ReasonCode.NOISE_NOT_FITTED: ("`verdict_ks`, `plausible`", "undetermined"),
+    ReasonCode.NON_FINITE_DERIVATIVES: ("`verdict_pose`, `plausible`", "undetermined"),
+    ReasonCode.MISFIT_RADIAL: ("`verdict_misfit`", "rejected"),
+    ReasonCode.MISFIT_TANGENTIAL: ("`verdict_misfit`", "rejected"),
+    ReasonCode.MISFIT_AFFINE: ("`verdict_misfit`", "rejected"),
+    ReasonCode.MISFIT_PRINCIPAL_POINT: ("`verdict_misfit`", "rejected"),
+    ReasonCode.MISFIT_ROLLING_SHUTTER: ("`verdict_misfit`", "rejected"),
+    ReasonCode.MISFIT_SMOOTH: ("`verdict_misfit`", "rejected"),
+    ReasonCode.SHARED_CAMERA: ("`verdict_misfit`", "rejected, beside the group"),
+    ReasonCode.MISFIT_NOT_TESTED: ("`verdict_misfit`", "remark; undetermined where no lens group ran"),
+    ReasonCode.POSE_NOT_OPTIMAL: ("`verdict_pose`", "rejected"),
+    ReasonCode.FOCAL_OUT_OF_RANGE: ("`plausible`", "rejected"),
+    ReasonCode.DISTORTION_FOLDS: ("`plausible`", "rejected"),
+    ReasonCode.PRINCIPAL_POINT_OUTSIDE: ("`plausible`", "rejected"),
+    ReasonCode.FOCAL_NOT_IDENTIFIED: ("`plausible`", "undetermined"),
+    ReasonCode.K1_NOT_IDENTIFIED: ("`plausible`", "remark"),
+    ReasonCode.LOW_COVERAGE: ("`plausible`", "undetermined"),
+    ReasonCode.FEW_OCCUPIED_CELLS: ("`plausible`", "undetermined"),
+}
 
 
 def table_page() -> str:
@@ -57,7 +164,29 @@ def config_page() -> str:
     return "\n".join([CONFIG_INTRODUCTION, "| setting | default | meaning |", "|---|---|---|", *rows, ""])
 
 
-PAGES = {"tables.md": table_page, "config.md": config_page}
+def findings_page() -> str:
+    """Return docs/findings.md."""
+    rows = [f"| `{code}` | {_cell(FINDING_MEANINGS[code])} |" for code in FindingCode]
+    return FINDINGS_PAGE + "\n".join(["| code | meaning |", "|---|---|", *rows, ""])
+
+
+def verdicts_page() -> str:
+    """Return docs/verdicts.md."""
+    rows = [
+        f"| `{code}` | {' | '.join(REASON_EFFECTS[code])} | {_cell(REASON_MEANINGS[code])} |" for code in ReasonCode
+    ]
+    reasons = "\n".join(
+        ["| code | verdict | makes it | meaning: what stands after the colon |", "|---|---|---|---|", *rows]
+    )
+    return VERDICTS_PAGE.format(reasons=reasons, **AuditConfig().model_dump())
+
+
+PAGES = {
+    "tables.md": table_page,
+    "config.md": config_page,
+    "findings.md": findings_page,
+    "verdicts.md": verdicts_page,
+}
 
 
 def main() -> int:
@@ -78,6 +207,8 @@ def main() -> int:
 
 
 def _arrow(kind: str) -> str:
+    if kind.startswith("dictionary<values=string"):
+        return "text"
     return kind.replace("element: ", "").replace("double", "float64").replace("string", "text")
 
 
