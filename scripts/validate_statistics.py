@@ -27,17 +27,16 @@ def main() -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer images, check only")
+    parser.add_argument("--share", type=float, default=1.0, help="of the full study's images, for a first look")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=0, help="processes; --quick: 1, else all cores")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of validation.md and figures/")
-    parser.add_argument("--tables", type=Path, help="also write what was measured there, a CSV file per part")
+    parser.add_argument(
+        "--keep", type=Path, help="folder of finished pieces, CSV files, from which a later run goes on"
+    )
     args = parser.parse_args()
     jobs = args.jobs or (1 if args.quick else os.cpu_count() or 1)
-    tables = run_tasks(quick_plan(args.seed) if args.quick else full_plan(args.seed), jobs)
-    if args.tables:
-        args.tables.mkdir(parents=True, exist_ok=True)
-        for part, frame in tables.items():
-            frame.to_csv(args.tables / f"{part}.csv", index=False)
+    tables = run_tasks(quick_plan(args.seed) if args.quick else full_plan(args.seed, args.share), jobs, args.keep)
     checks = all_checks(tables)
     for check in checks:
         if check.outcome != HOLDS:

@@ -27,7 +27,7 @@ _FUNCTION_TOLERANCE = 1e-10
 
 def advise_one(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     """Scenes with one defective image: refit with that image's advised camera; no row where it was not rejected."""
-    scene, model = simulate(design, scene_idx, seed)
+    scene, model, _ = simulate(design, scene_idx, seed)
     before = ModelAuditor(model, AuditConfig()).tables().images.to_pandas()
     rows = []
     for defect in scene.defects:
@@ -49,7 +49,7 @@ def advise_one(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
 
 def advise_shared(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     """Scenes whose images share one wrong camera: refit with the camera's advised model."""
-    scene, model = simulate(design, scene_idx, seed)
+    scene, model, _ = simulate(design, scene_idx, seed)
     camera = ModelAuditor(model, AuditConfig()).tables().cameras.to_pandas().iloc[0]
     advised = camera["advised_camera_model"]
     row: dict[str, object] = {

@@ -37,7 +37,7 @@ def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> str
     sections = [
         words.INTRO.format(seed=seed, holds=HOLDS, chance=WITHIN_CHANCE, violated=VIOLATED.lower()),
         _claims(checks),
-        words.SETUP.format(tau=TAU_PX),
+        _setup(tables["scenes"]),
         _single_size(tables["singles"]),
         _scene_size(tables["scenes"]),
         _power(tables["power"], tables["exact"]),
@@ -114,6 +114,14 @@ def _single_size(singles: pd.DataFrame) -> str:
             ),
         ]
     )
+
+
+def _setup(scenes: pd.DataFrame) -> str:
+    per_scene = scenes.drop_duplicates(["design", "noise", "n", "scene"])
+    failed = per_scene[per_scene["num_failed"] > 0]
+    where = ", ".join(sorted(set(failed["design"]))) or "none"
+    redrawn = f"{int(failed['num_failed'].sum())} beside {len(per_scene)} (designs: {where})"
+    return words.SETUP.format(tau=TAU_PX, redrawn=redrawn)
 
 
 def _any(frame: pd.DataFrame, verdict: str) -> str:

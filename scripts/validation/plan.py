@@ -19,31 +19,35 @@ _SCENES_OF_SIZE = {25: 25, 50: 25, 100: 25, 250: 25, 600: 25, 2000: 12, 5000: 4}
 _SCENES_OF_OTHER_NOISE = {25: 8, 50: 8, 100: 8, 250: 8, 600: 8, 2000: 4, 5000: 1}
 
 
-def full_plan(seed: int) -> list[Task]:
-    """Everything."""
+def full_plan(seed: int, share: float = 1.0) -> list[Task]:
+    """Everything; ``share`` of the images and scenes, at least one of each."""
+
+    def some(count: int) -> int:
+        return max(1, round(count * share))
+
     tasks = []
     for noise in NOISES:
         for n in SIZES:
-            tasks += _singles(noise, n, 1000, seed)
+            tasks += _singles(noise, n, some(1000), seed)
             counts = _SCENES_OF_SIZE if noise in BOUNDED_NOISES else _SCENES_OF_OTHER_NOISE
-            tasks += _scenes(Design("size", 0, noise, n), counts[n], seed)
-        tasks += _scenes(Design("size, shared camera", 1, noise, 250, shared_k2=0.0), 6, seed)
-        tasks += _scenes(Design("none", 2, noise), 8, seed)
-        tasks += _scenes(Design("quarter", 3, noise, share=0.25), 12, seed)
-        tasks += _scenes(Design("half", 4, noise, share=0.5), 6, seed)
-        tasks += _scenes(Design("quarter, 150 points", 5, noise, 150, share=0.25), 4, seed)
+            tasks += _scenes(Design("size", 0, noise, n), some(counts[n]), seed)
+        tasks += _scenes(Design("size, shared camera", 1, noise, 250, shared_k2=0.0), some(6), seed)
+        tasks += _scenes(Design("none", 2, noise), some(8), seed)
+        tasks += _scenes(Design("quarter", 3, noise, share=0.25), some(12), seed)
+        tasks += _scenes(Design("half", 4, noise, share=0.5), some(6), seed)
+        tasks += _scenes(Design("quarter, 150 points", 5, noise, 150, share=0.25), some(4), seed)
         short = SceneSpec(max_track_length=4)
-        tasks += _scenes(Design("quarter, short tracks", 6, noise, share=0.25, scene=short), 4, seed)
-        tasks += _scenes(Design("poses and corners", 7, noise, num_poses=4, num_corners=4), 6, seed)
-        tasks += _shared(Design("shared", 8, noise, 150, shared_k2=0.0, scene=_SMALL), 15, seed)
+        tasks += _scenes(Design("quarter, short tracks", 6, noise, share=0.25, scene=short), some(4), seed)
+        tasks += _scenes(Design("poses and corners", 7, noise, num_poses=4, num_corners=4), some(6), seed)
+        tasks += _shared(Design("shared", 8, noise, 150, shared_k2=0.0, scene=_SMALL), some(15), seed)
     for kind in CAMERA_DEFECTS:
         for n in POWER_SIZES:
             tasks += [Task("power", power_trials, (kind, n, 200 * k, 200 * k + 200, seed), 2.5) for k in range(2)]
     for kind in EXACT_DEFECTS:
         tasks += [Task("exact", exact_trials, (kind, _BATCH * k, _BATCH * k + _BATCH, seed), 2.0) for k in range(4)]
     for k2 in SHARED_K2:
-        tasks += _shared(Design("shared", 9, n=150, shared_k2=k2, scene=_SMALL), 12, seed)
-    return tasks + _advice(120, 8, seed)
+        tasks += _shared(Design("shared", 9, n=150, shared_k2=k2, scene=_SMALL), some(12), seed)
+    return tasks + _advice(some(120), some(8), seed)
 
 
 def quick_plan(seed: int) -> list[Task]:

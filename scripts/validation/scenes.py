@@ -10,7 +10,7 @@ import pandas as pd
 from audit.config import AuditConfig
 from audit.engine import ModelAuditor
 from audit.misfit import GROUPS
-from audit.simulate.adjust import adjust_scene, sparse_model
+from audit.simulate.adjust import AdjustmentError, adjust_scene, sparse_model
 from audit.simulate.defects import DefectKind, DefectSpec
 from audit.simulate.noise import NoiseKind
 from audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
@@ -19,7 +19,9 @@ from scripts.validation.rivals import rival_columns
 from scripts.validation.truth import CAMERA_DEFECTS, SOUND, noise_of
 
 IMAGES_PER_SCENE = 40
+_ATTEMPTS = 3
 _SEED = 4
+_MAX_DRAWS = 5
 _SIZES_PX = (0.2, 1.2)
 _POSE_PX = (1.0, 3.0)
 _CORNER_POINTS = (8, 25)  # below the last
@@ -79,17 +81,25 @@ class Design:
         )
 
 
-def simulate(design: Design, scene_idx: int, seed: int) -> tuple[SimulatedScene, SparseModel]:
-    """Simulate and adjust one scene."""
+def simulate(design: Design, scene_idx: int, seed: int) -> tuple[SimulatedScene, SparseModel, int]:
+    """Simulate and adjust one scene; scenes that bundle adjustment cannot bring to an optimum are drawn again.
+
+    Returns the scene, its model, and how many were drawn in vain (a corner's few points can leave an image adrift).
+    """
     noise_idx = list(NoiseKind).index(design.noise)
-    rng = np.random.default_rng([seed, _SEED, design.code, noise_idx, design.n, scene_idx])
-    scene = simulate_scene(design.spec(rng, scene_idx), rng)
-    return scene, sparse_model(scene, adjust_scene(scene))
+    for num_failed in range(_MAX_DRAWS):
+        rng = np.random.default_rng([seed, _SEED, design.code, noise_idx, design.n, scene_idx, num_failed])
+        scene = simulate_scene(design.spec(rng, scene_idx), rng)
+        try:
+            return scene, sparse_model(scene, adjust_scene(scene)), num_failed
+        except AdjustmentError:
+            continue
+    raise AdjustmentError(f"{design.name}, scene {scene_idx}: {_MAX_DRAWS} scenes could not be adjusted")
 
 
 def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     """Audit one scene; a row per image."""
-    scene, model = simulate(design, scene_idx, seed)
+    scene, model, num_failed = simulate(design, scene_idx, seed)
     auditor = ModelAuditor(model, AuditConfig())
     tables = auditor.tables()
     images = tables.images.to_pandas()
@@ -98,6 +108,7 @@ def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     frame.insert(1, "noise", str(design.noise))
     frame.insert(2, "n", design.n)
     frame.insert(3, "scene", scene_idx)
+    frame["num_failed"] = num_failed
     frame["noise_nu0"] = tables.models["noise_nu0"][0].as_py()
     frame["shared_reason"] = [any(text.startswith("shared_camera") for text in texts) for texts in images["reasons"]]
     frame["most_are_wrong"] = auditor.blame.most_are_wrong
@@ -120,7 +131,7 @@ def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
 
 def audit_shared_camera(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     """Audit one scene whose images share a camera; one row: the pooled tests and what the images say."""
-    _, model = simulate(design, scene_idx, seed)
+    _, model, num_failed = simulate(design, scene_idx, seed)
     tables = ModelAuditor(model, AuditConfig()).tables()
     camera, images = tables.cameras.to_pandas().iloc[0], tables.images.to_pandas()
     rejected = images["verdict_misfit"] == "rejected"
@@ -136,5 +147,6 @@ def audit_shared_camera(design: Design, scene_idx: int, seed: int) -> pd.DataFra
         "share_rejected": float(rejected.mean()),
         "share_shared_reason": float(shared.mean()),
         "num_images": len(images),
+        "num_failed": num_failed,
     }
     return pd.DataFrame([row])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
+from pathlib import Path
 
 import pandas as pd
 from scipy import stats
@@ -33,28 +36,52 @@ class Task:
         return self.function(*self.args)
 
 
-def run_tasks(tasks: Sequence[Task], jobs: int) -> dict[str, pd.DataFrame]:
-    """Run all tasks and return the tables by part; the rows do not depend on ``jobs``, nor on who was first."""
-    done: list[pd.DataFrame | None] = [None] * len(tasks)
-    progress = tqdm(total=sum(task.cost for task in tasks), disable=None, unit="s", bar_format="{l_bar}{bar}|{elapsed}")
-    if jobs == 1:
-        with threadpool_limits(limits=1, user_api="blas"):
-            for row, task in enumerate(tasks):
-                done[row] = task()
-                progress.update(task.cost)
-    else:
-        order = sorted(range(len(tasks)), key=lambda row: -tasks[row].cost)
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_one_thread) as pool:
-            futures = {pool.submit(tasks[row]): row for row in order}
-            for future in as_completed(futures):
+def run_tasks(tasks: Sequence[Task], jobs: int, keep: Path | None = None) -> dict[str, pd.DataFrame]:
+    """Run all tasks and return the tables by part; the rows do not depend on ``jobs``, nor on who was first.
+
+    With ``keep``, what is done is kept in that folder, and not done again by a later run of the same code.
+    """
+    progress = tqdm(total=sum(task.cost for task in tasks), disable=None, bar_format="{l_bar}{bar}| {elapsed}")
+    done: dict[int, pd.DataFrame] = {}
+    errors: list[Exception] = []
+    order = sorted(range(len(tasks)), key=lambda row: -tasks[row].cost)
+    with _pool(jobs) as pool:
+        futures = {pool.submit(_run, tasks[row], keep): row for row in order}
+        for future in as_completed(futures):
+            error = future.exception()
+            if isinstance(error, Exception):
+                errors.append(error)
+            else:
                 done[futures[future]] = future.result()
-                progress.update(tasks[futures[future]].cost)
+            progress.update(tasks[futures[future]].cost)
     progress.close()
+    if errors:
+        raise ExceptionGroup(f"{len(errors)} of {len(tasks)} tasks failed", errors)
     frames: dict[str, list[pd.DataFrame]] = {}
-    for task, frame in zip(tasks, done, strict=True):
-        if frame is not None:
-            frames.setdefault(task.part, []).append(frame)
+    for row, task in enumerate(tasks):
+        frames.setdefault(task.part, []).append(done[row])
     return {part: pd.concat(parts, ignore_index=True) for part, parts in frames.items()}
+
+
+def _pool(jobs: int) -> Executor:
+    """One process is this one."""
+    if jobs == 1:
+        return ThreadPoolExecutor(1, initializer=_one_thread)
+    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_one_thread)
+
+
+def _run(task: Task, keep: Path | None) -> pd.DataFrame:
+    """Run a task, or read what it gave before."""
+    if keep is None:
+        return task()
+    name = f"{task.part} {task.function.__name__} {task.args!r}"
+    path = keep / f"{task.part}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.csv"
+    if not path.exists():
+        keep.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}")
+        task().to_csv(part, index=False)
+        part.replace(path)
+    return pd.read_csv(path, keep_default_na=False, na_values=[""], float_precision="round_trip")
 
 
 def _one_thread() -> None:

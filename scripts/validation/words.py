@@ -31,7 +31,8 @@ image is audited as `--points independent` under the `constant` noise model.
 
 *Scenes*: 40 images on a jittered grid, own camera each unless said otherwise, tracks of 3 to 15 images, about n points
 per image. Poses, points, f and k1 are bundle-adjusted with pycolmap to convergence, then the model is audited with the
-defaults (`track` noise model, tau = {tau} px).
+defaults (`track` noise model, tau = {tau} px). Scenes that did not reach an optimum, because an image with few points
+in a corner drifts, were drawn again: {redrawn}.
 
 *Defects* have a random direction and a systematic size: the RMS length in px of what remains of the noise-free
 displacement after the image's own pose, f and k1 were refitted to the true points. Of six kinds in turn: k2, k3,

@@ -69,7 +69,7 @@ def test_single_images_are_fitted():
 
 
 def test_a_larger_model_starts_as_the_same_camera_and_improves():
-    scene, model = simulate(Design("one image", 10, n=90, share=0.05, scene=SMALL), 2, 1)
+    scene, model, _ = simulate(Design("one image", 10, n=90, share=0.05, scene=SMALL), 2, 1)
     row = scene.defects[0].image_idx
     switched = with_models(model, {row: "OPENCV"})
     assert_allclose(model_residuals(switched).residuals_px, model_residuals(model).residuals_px, atol=1e-9)

@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -244,3 +245,36 @@ def test_the_metadata_of_a_part_does_not_change_its_rows(tmp_path):
         store.write(A, STATE, tables, 0.1)
     read = pa.parquet.ParquetFile(tmp_path / "images" / f"part-{A.key}.parquet").read()
     assert read.equals(tables["images"])
+
+
+def test_run_json_is_written_input_by_input_and_is_what_json_would_make_of_it(tmp_path):
+    refs = [make_ref(f'data/ä{i}"/sparse/0', scene=f'ä{i}"') for i in range(3)]
+    write_run(tmp_path, refs)
+    text = (tmp_path / "run.json").read_text(encoding="utf-8")
+    info = json.loads(text)
+    assert [item["scene"] for item in info["inputs"]] == [ref.scene for ref in refs]
+    assert sum('"model_path"' in line for line in text.splitlines()) == 3
+    write_run(tmp_path / "empty", [])
+    assert run_json(tmp_path / "empty")["inputs"] == []
+
+
+def test_what_is_kept_of_a_finished_model_is_small(tmp_path):
+    """A run may have 100,000 models: 1 kB each, not the config and the stamps that stand in every part."""
+    refs = [make_ref(f"data/{i}/sparse/0", scene=str(i)) for i in range(50)]
+    write_run(tmp_path, refs)
+    with RunStore(tmp_path, settings()) as store:
+        tracemalloc.start()
+        assert all(store.finished(ref) for ref in refs)
+        size, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert size / len(refs) < 1500
+
+
+def test_the_mark_of_a_model_is_gone_from_the_disk_before_its_parts_are_written_again(tmp_path, monkeypatch):
+    write_run(tmp_path, [A])
+    flushed = []
+    with RunStore(tmp_path, settings()) as store:
+        monkeypatch.setattr(store_module, "_flush_folder", lambda folder: flushed.append(folder.name))
+        store.write(A, InputState(1, "new", "new"), sample_tables(A), 0.1)
+    assert flushed[0] == "models"
+    assert flushed[-1] == "models"
