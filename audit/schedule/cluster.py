@@ -23,6 +23,7 @@ LOCAL: Final = "local"
 _LOOPBACK: Final = "127.0.0.1"
 _CONNECT_SECONDS: Final = 30
 _FIRST_WORKER_SECONDS: Final = 300
+_LOCAL_WORKERS_SECONDS: Final = 60
 _AHEAD: Final = 2  # models asked for per thread of the workers
 _LOST: Final = "the cluster was lost; what was finished stays, the same command goes on"
 
@@ -114,9 +115,15 @@ def _client(address: str, jobs: int) -> Iterator[Client]:
         }
         with (
             dask.config.set(settings),
-            _local_cluster(jobs) as cluster,
+            _local_cluster() as cluster,
             Client(cluster, set_as_default=False) as client,
         ):
+            cluster.scale(jobs)
+            try:  # with n_workers=jobs the constructor would wait for ever for a worker that died while it started
+                client.wait_for_workers(jobs, timeout=_LOCAL_WORKERS_SECONDS)
+            except TimeoutError as error:
+                reason = f"not all in {_LOCAL_WORKERS_SECONDS} s"
+                raise ClusterError(f"--dask local: the workers did not start ({reason}); run it again") from error
             yield client
         return
     try:
@@ -132,10 +139,12 @@ def _client(address: str, jobs: int) -> Iterator[Client]:
         yield client
 
 
-def _local_cluster(jobs: int) -> LocalCluster:
+def _local_cluster() -> LocalCluster:
+    """Return a cluster on the loopback that has no workers yet."""
     try:
         return LocalCluster(
-            n_workers=jobs,
+            n_workers=0,
+            processes=True,
             threads_per_worker=1,
             host=_LOOPBACK,
             dashboard_address=f"{_LOOPBACK}:0",
@@ -144,6 +153,6 @@ def _local_cluster(jobs: int) -> LocalCluster:
             memory_limit=0,
             silence_logs=logging.CRITICAL,
         )
-    except RuntimeError as error:  # a worker died while it started
+    except RuntimeError as error:  # no port, no thread
         reason = " ".join(str(error).split())
         raise ClusterError(f"--dask local: the workers did not start ({reason}); run it again") from error
