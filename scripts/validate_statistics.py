@@ -23,6 +23,15 @@ from scripts.validation.study import HOLDS, VIOLATED, run_tasks
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
+def _said(page: str, share: float) -> str:
+    """Say on the page that it is not the full study."""
+    if share == 1.0:
+        return page
+    return page.replace(
+        "# Validation\n", f"# Validation\n\nMade with `--share {share:g}`: that part of the full study.\n", 1
+    )
+
+
 def main() -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -48,7 +57,9 @@ def main() -> int:
     print(f"{len(checks)} bounds, {violated} violated")
     if not args.quick:
         args.docs.mkdir(parents=True, exist_ok=True)
-        (args.docs / "validation.md").write_text(document(tables, checks, args.seed), encoding="utf-8")
+        (args.docs / "validation.md").write_text(
+            _said(document(tables, checks, args.seed), args.share), encoding="utf-8"
+        )
         draw_figures(tables, args.docs / "figures")
     return 1 if violated else 0
 
