@@ -13,7 +13,7 @@ from audit.simulate.defects import DefectKind
 from audit.simulate.noise import NoiseKind
 from scripts.validation.singles import EXACT_DEFECTS
 from scripts.validation.study import HOLDS, VIOLATED, Check, check
-from scripts.validation.truth import ALPHA, ANSWERS, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
+from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
 
 Tables = dict[str, pd.DataFrame]
 LEVEL_TESTS: Final = ("ks_fitted", "dap", "sw")
