@@ -13,7 +13,7 @@ from audit.simulate.defects import DefectKind
 from audit.simulate.noise import NoiseKind
 from scripts.validation.singles import EXACT_DEFECTS
 from scripts.validation.study import HOLDS, VIOLATED, Check, check
-from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
+from scripts.validation.truth import ALPHA, ANSWERS, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
 
 Tables = dict[str, pd.DataFrame]
 LEVEL_TESTS: Final = ("ks_fitted", "dap", "sw")
@@ -111,15 +111,22 @@ def _goodness_of_fit(frame: pd.DataFrame) -> Iterator[Check | Within]:
 
 
 def _power(exact: pd.DataFrame) -> Iterator[Check]:
-    found = of_namesake(exact, "p") < ALPHA
-    for kind, numbers in EXACT_DEFECTS.items():
-        cell = f"{kind} = {', '.join(f'{number:g}' for number in numbers)}, group {NAMESAKE[kind]}"
-        yield check("power at n = 250, sigma 0.5 px", cell, found[exact["kind"] == str(kind)], 0.95)
+    groups = {DefectKind.RADIAL_K2: "radial", DefectKind.TANGENTIAL: "tangential"}
+    for kind, group in groups.items():
+        part = exact[exact["kind"] == str(kind)]
+        values = ", ".join(f"{value:g}" for value in EXACT_DEFECTS[kind])
+        cell = f"{kind} = {values}, group {group}"
+        yield check("power at n = 250, sigma 0.5 px", cell, part[f"misfit_{group}_p"] < ALPHA, 0.95)
 
 
 def effect_ratio(frame: pd.DataFrame) -> pd.Series:
-    """The measured effect, in the group that bears the defect's name, over the true systematic RMS."""
-    return of_namesake(frame, "px") / frame["true_px"]
+    """The measured effect in the largest group that counts as the right answer, over the true systematic RMS."""
+    ratio = pd.Series(float("nan"), index=frame.index)
+    for kind, groups in ANSWERS.items():
+        rows = frame["kind"] == str(kind)
+        columns = [f"misfit_{group}_px" for group in groups if group != "affine" or kind is DefectKind.ASPECT]
+        ratio[rows] = frame.loc[rows, columns].max(axis=1) / frame.loc[rows, "true_px"]
+    return ratio
 
 
 def _effects(exact: pd.DataFrame, power: pd.DataFrame) -> Iterator[Check | Within]:
@@ -137,14 +144,11 @@ def _effects(exact: pd.DataFrame, power: pd.DataFrame) -> Iterator[Check | Withi
         yield Within("median effect within 20 % of the truth above 0.1 px, n = 250", str(kind), median, 0.8, 1.2)
 
 
-def _quarter(frame: pd.DataFrame) -> Iterator[Check | Within]:
+def _quarter(frame: pd.DataFrame) -> Iterator[Check]:
     where = "a quarter of the images defective"
     rejected = frame["verdict_misfit"] == "rejected"
     sound = frame["kind"] == SOUND
     yield check(f"sound images rejected by verdict_misfit, {where}", "all noises", rejected[sound], 0.0, 0.015)
-    number = f"number of images, {where}"
-    yield Within(f"{number}: 2000 sound", "all noises", int(sound.sum()), 2000, float("inf"))
-    yield Within(f"{number}: 600 wrong", "all noises", int((~sound).sum()), 600, float("inf"))
     large = frame["true_px"] >= _MATERIAL
     yield check(f"images of >= {_LARGE} systematic error rejected, {where}", "all noises", rejected[large], 0.95)
     found = frame[rejected & ~sound]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import pandas as pd
-
 from audit.misfit import MisfitGroup
 from audit.simulate.defects import DefectKind
 from audit.simulate.noise import NoiseKind, NoiseSpec
@@ -32,16 +30,6 @@ ANSWERS: Final[dict[DefectKind, frozenset[MisfitGroup]]] = {
 }
 """Tangential and principal point are nearly the same field; affine may answer rolling shutter, not the reverse."""
 
-NAMESAKE: Final[dict[DefectKind, MisfitGroup]] = {
-    DefectKind.RADIAL_K2: MisfitGroup.RADIAL,
-    DefectKind.RADIAL_K3: MisfitGroup.RADIAL,
-    DefectKind.TANGENTIAL: MisfitGroup.TANGENTIAL,
-    DefectKind.ASPECT: MisfitGroup.AFFINE,
-    DefectKind.PRINCIPAL_POINT: MisfitGroup.PRINCIPAL_POINT,
-    DefectKind.ROLLING_SHUTTER: MisfitGroup.ROLLING_SHUTTER,
-}
-"""The group that bears a defect's name."""
-
 SOUND: Final = "none"
 NOISES: Final = tuple(NoiseKind)
 SIZES: Final = (25, 50, 100, 250, 600, 2000, 5000)
@@ -55,12 +43,3 @@ def noise_of(kind: NoiseKind, sigma_px: float = SIGMA_PX) -> NoiseSpec:
 def is_right(kind: str, answer: object) -> bool:
     """Whether ``answer`` names the planted cause."""
     return kind != SOUND and isinstance(answer, str) and MisfitGroup(answer) in ANSWERS[DefectKind(kind)]
-
-
-def of_namesake(frame: pd.DataFrame, what: str) -> pd.Series:
-    """Return ``p`` or ``px`` of the group that bears the name of each row's defect."""
-    values = pd.Series(float("nan"), index=frame.index)
-    for kind, group in NAMESAKE.items():
-        rows = frame["kind"] == str(kind)
-        values[rows] = frame.loc[rows, f"misfit_{group}_{what}"]
-    return values
