@@ -13,11 +13,11 @@ LINTERS = {"import-linter", "mypy", "pandas-stubs", "pyarrow-stubs", "ruff", "sc
 
 
 def versions(lines, operator):
-    """Name to version; every requirement must be exactly one `operator` clause."""
+    """Name to version; every requirement must have exactly one `operator` clause, and perhaps an upper bound."""
     found = {}
     for line in lines:
         requirement = Requirement(line)
-        (clause,) = requirement.specifier
+        (clause,) = (clause for clause in requirement.specifier if clause.operator != "<")
         assert clause.operator == operator, line
         found[canonicalize_name(requirement.name)] = Version(clause.version)
     return found

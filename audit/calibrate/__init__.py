@@ -1,0 +1,1 @@
+"""Find a camera that nobody has from 2D-3D correspondences (extended PnP), and how well it is known."""
