@@ -60,7 +60,7 @@ def test_radial_folds_as_its_polynomial_says(focal, centre, k1, k2, power):
 @given(
     focal=st.floats(500.0, 3000.0),
     k=st.tuples(*[st.floats(-0.6, 0.6)] * 2),
-    # Real lenses stay below 0.005; beyond 0.03 a wide image's corner folds by decentring alone, between the rays we try.
+    # Real lenses stay below 0.005; beyond 0.03 a wide corner folds by decentring alone, between the rays we try.
     p=st.tuples(*[st.floats(-0.02, 0.02)] * 2),
     more=st.tuples(*[st.floats(-0.3, 0.3)] * 4),
     name=st.sampled_from(["OPENCV", "FULL_OPENCV", "THIN_PRISM_FISHEYE", "OPENCV_FISHEYE"]),
