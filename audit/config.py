@@ -41,6 +41,13 @@ class AuditConfig(BaseModel):
         lt=1,
         description="level of the tests: an image is rejected when its p-value is below",
     )
+    min_ks_distance: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="verdict_ks rejects only where D is larger too; 0 is the paper's decision, which with thousands of "
+        "observations an image rejects noise that is hardly different (0.03 asks for a visible difference)",
+    )
     min_observations: int = Field(
         default=20,
         ge=2,

@@ -202,7 +202,7 @@ def _judge(
     num_inliers = residuals_px.shape[1]
     exact = _exact(inliers, residuals_px)
     no_ks = _too_few("standardised", len(noise.z), num_inliers, config) or exact or _no_noise(noise)
-    ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha)
+    ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha, min_distance=config.min_ks_distance)
     if no_ks is not None:
         ks = Judgement(Verdict.UNDETERMINED, (no_ks,))
     limits = _limits(config)

@@ -91,9 +91,9 @@ class Judgement:
     reasons: tuple[Reason, ...] = ()
 
 
-def judge_ks(ks_stat: float, ks_p: float, num_values: int, *, alpha: float) -> Judgement:
-    """The paper's decision: rejected when ks_p < alpha."""
-    if ks_p < alpha:
+def judge_ks(ks_stat: float, ks_p: float, num_values: int, *, alpha: float, min_distance: float = 0.0) -> Judgement:
+    """The paper's decision: rejected when ks_p < alpha; and, where asked for, D is larger than ``min_distance``."""
+    if ks_p < alpha and ks_stat > min_distance:
         detail = f"p = {ks_p:.3g} < {alpha:g}, D = {ks_stat:.4f}, {num_values} values"
         return Judgement(Verdict.REJECTED, (Reason(ReasonCode.KS_REJECTED, detail),))
     return Judgement(Verdict.ACCEPTED)

@@ -52,8 +52,8 @@ alone would remove (0: the points are at their optimum)."""
 VERDICT_INTRO: Final = """\
 Default settings: noise `track`, policy `full`, tau 0.2 px. A/R/U: images accepted, rejected, undetermined. ks, misfit,
 pose, plausible: images that this verdict rejects (an image can be rejected by several). Camera finding: what the pooled
-test says of a shared camera (largest group, px, q); for cameras with one image each, how often which cause was named.
-Advice: COLMAP model that holds what was found."""
+test says of a shared camera (its cause, px, q, from 0.05 px on); for cameras with one image each, how often which cause
+was named. Advice: COLMAP model that holds what was found."""
 EXPLAIN_INTRO: Final = """\
 Written by a person, about every model of which more than half of the images is rejected. The numbers in the texts are
 of this run; the script checks that they still support what is said. Words used:
@@ -67,6 +67,8 @@ of this run; the script checks that they still support what is said. Words used:
 - *neighbours*: correlation of the residuals of points less than 1/40 of the longer side apart (same keypoint left out).
 - *persistence*: correlation of a point's residuals in one image and the next one by name.
 - *refitted*: bundle adjustment (pycolmap, principal points fixed) with the camera model named, audited again."""
+
+_WORTH_NAMING_PX = 0.05  # of a pooled finding: with a million observations a thousandth of a pixel is significant
 
 
 def corpus_folders(given: Sequence[Path]) -> list[Path]:
@@ -209,7 +211,7 @@ def _finding(model: AuditedModel) -> str:
         found = [
             f"{c.misfit_group} {c.misfit_px:.2f} px, q {c.misfit_q:.0e}"
             for c in cameras.itertuples()
-            if isinstance(c.misfit_group, str)
+            if isinstance(c.misfit_group, str) and c.misfit_px >= _WORTH_NAMING_PX
         ]
         return "; ".join(found) or "none"
     causes = Counter(group for group in cameras.misfit_group if isinstance(group, str))

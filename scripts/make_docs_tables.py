@@ -64,8 +64,8 @@ image does not say enough: undetermined is no pass.
 
 | column | question | rejected | undetermined |
 |---|---|---|---|
-| `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} | \
-fewer than {min_observations} standardised observations; no noise fitted |
+| `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} \
+(with `min_ks_distance`: and D above it) | fewer than {min_observations} standardised observations; no noise fitted |
 | `verdict_misfit` | Does the camera model hold? | after peeling, a group has q < {alpha} *and* an effect above \
 {min_effect} | fewer than {min_observations} observations of sound points; none of radial, tangential, affine, \
 principal_point could run |

@@ -156,6 +156,13 @@ def test_alpha_moves_the_verdict_and_the_reason_carries_the_numbers(model):
     assert f"D = {row['ks_stat']:.4f}" in row["reasons"][0]
 
 
+def test_a_distance_that_matters_can_be_asked_of_ks(model):
+    distance = audit_model(model, AuditConfig(alpha=0.999)).images.to_pylist()[0]["ks_stat"]
+    for least, verdict in ((0.99 * distance, "rejected"), (1.01 * distance, "accepted")):
+        row = audit_model(model, AuditConfig(alpha=0.999, min_ks_distance=least)).images.to_pylist()[0]
+        assert row["verdict_ks"] == verdict
+
+
 def test_an_empty_model_has_empty_tables(model):
     none = np.empty(0, dtype=np.int64)
     empty = replace(
