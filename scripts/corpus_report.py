@@ -210,8 +210,8 @@ def _finding(model: AuditedModel) -> str:
     if len(cameras) <= 2:
         found = [
             f"{c.misfit_group} {c.misfit_px:.2f} px, q {c.misfit_q:.0e}"
-            for c in cameras.itertuples()
-            if isinstance(c.misfit_group, str) and c.misfit_px >= _WORTH_NAMING_PX
+            for c in cameras[cameras.misfit_px >= _WORTH_NAMING_PX].itertuples()
+            if isinstance(c.misfit_group, str)
         ]
         return "; ".join(found) or "none"
     causes = Counter(group for group in cameras.misfit_group if isinstance(group, str))
