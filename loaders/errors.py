@@ -8,9 +8,9 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A place in a file: a byte offset in binary files, a 1-based line number in text files."""
+    """A place in a file: a byte offset in binary files, a 1-based line number in text files or row of a table."""
 
-    unit: Literal["byte", "line"]
+    unit: Literal["byte", "line", "row"]
     number: int
 
     def __str__(self) -> str:

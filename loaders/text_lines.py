@@ -24,12 +24,16 @@ _RECOPY: Final = "copy or export the reconstruction again"
 
 @dataclass(frozen=True, slots=True)
 class TextFile:
-    """The lines of one file; ``stated_count`` is what its comment "# Number of ...: N" says, None without one."""
+    """The lines of one file; ``stated_count`` is what its comment "# Number of ...: N" says, None without one.
+
+    advice: what to do about a line that is not what it should be.
+    """
 
     path: InputPath
     lines: list[bytes]
     stated_count: int | None
     is_terminated: bool
+    advice: str = _ADVICE
 
     def records(self) -> Iterator[tuple[int, bytes]]:
         """Yield line numbers (from 1) and lines that are neither blank nor comments, without surrounding blanks."""
@@ -40,27 +44,27 @@ class TextFile:
 
     def malformed(self, line: int, wanted: str, got: str) -> MalformedFileError:
         """Return the error for a line that is not what it should be."""
-        return MalformedFileError(str(self.path), Position("line", line), wanted, got, _ADVICE)
+        return MalformedFileError(str(self.path), Position("line", line), wanted, got, self.advice)
 
     def truncated(self, wanted: str, got: str) -> TruncatedFileError:
         """Return the error for a file that ends too early."""
         return TruncatedFileError(str(self.path), Position("line", len(self.lines)), wanted, got, _RECOPY)
 
 
-def read_text(path: InputPath) -> TextFile:
+def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
     """Read a text file; errors as of `loaders.files.open_input`, and MalformedFileError where it is no text."""
     data = read_bytes(path).removeprefix(_BYTE_ORDER_MARK)
     nul = data.find(b"\0")
     if nul >= 0:
         line = data.count(b"\n", 0, nul) + 1
-        raise MalformedFileError(str(path), Position("line", line), "text", "a NUL byte", _ADVICE)
+        raise MalformedFileError(str(path), Position("line", line), "text", "a NUL byte", advice)
     lines = data.split(b"\n")
     is_terminated = not lines[-1]
     if is_terminated:
         lines.pop()
     comments = (line for line in lines if line.lstrip().startswith(b"#"))
     stated = next((match for line in comments if (match := _STATED_COUNT.match(line.lstrip()))), None)
-    return TextFile(path, lines, int(stated[1]) if stated else None, is_terminated)
+    return TextFile(path, lines, int(stated[1]) if stated else None, is_terminated, advice)
 
 
 def check_count(

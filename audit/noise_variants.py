@@ -1,0 +1,95 @@
+"""Variance fits to compare with: what maximum likelihood says, and the paper's initial weights taken literally.
+
+Both fit (1) of method.md section 2, as `audit.noise.fit_variance` does, whose robust fit is what verdicts stand on.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy import optimize
+
+from audit.noise import UNDETERMINED, VarianceFit, scoring_step
+from loaders.arrays import FloatArray
+
+INITIAL_SIGMA_PX: Final = 5.0  # of the paper's initial weights, px
+_SHARES: Final = 65  # of theta_2, among which the best bracket is looked for
+_SHARE_TOLERANCE: Final = 1e-10
+_RELATIVE_CHANGE: Final = 1e-8
+_MAX_STEPS: Final = 100
+
+
+def fit_variance_likelihood(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> VarianceFit:
+    """Fit var = theta_1 + theta_2 a^2 (1) by Gaussian maximum likelihood, theta >= 0: the plain, non-robust scale.
+
+    Parameters
+    ----------
+    sq_residuals_px2 : (m,) y, squared residuals of single axes, px^2
+    predictor_px2 : (m,) a^2, px^2, finite and >= 0
+
+    Notes
+    -----
+    Minimises sum (ln s_j + y_j / s_j) / 2, s = theta_1 + theta_2 a^2. With b_j = (1 - w) + w a_j^2 / mean a^2 and
+    s = t b, the best t for a share w is mean(y / b): one bounded number is left, 0 <= w <= 1, whose profile may have
+    two minima. It is looked through before it is refined. A residual of exactly 0 at a^2 = 0 makes the likelihood
+    unbounded at theta_1 = 0: that end is left out where some a^2 = 0. All y = 0: undetermined.
+    """
+    y, a_sq = sq_residuals_px2, predictor_px2
+    if y.size == 0 or not np.isfinite(y).all() or not y.any():
+        return UNDETERMINED
+    if not a_sq.any():
+        return VarianceFit(float(y.mean()), 0.0, converged=True)
+    relative = a_sq / a_sq.mean()
+
+    def shape(share: float) -> FloatArray:
+        return np.asarray(1.0 - share + share * relative)
+
+    def cost(share: float) -> float:
+        b = shape(share)
+        return float(np.log(np.mean(y / b)) + np.mean(np.log(b)))
+
+    end = 1.0 if a_sq.min() > 0.0 else 1.0 - 1.0 / _SHARES
+    shares = np.linspace(0.0, end, _SHARES)
+    best = int(np.argmin([cost(share) for share in shares.tolist()]))
+    low, high = shares[max(best - 1, 0)], shares[best + 1] if best + 1 < _SHARES else 1.0
+    found = optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": _SHARE_TOLERANCE})
+    ends = [0.0, float(found.x), *([1.0] if a_sq.min() > 0.0 else [])]
+    share = min(ends, key=cost)
+    scale = float(np.mean(y / shape(share)))
+    return VarianceFit(scale * (1.0 - share), scale * share / float(a_sq.mean()), converged=bool(found.success))
+
+
+def literal_start(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> FloatArray:
+    """Theta (2,) of weighted least squares of y on (1, a^2), theta >= 0, weights 1 / p(eps | sigma = 5 px).
+
+    p is the normal density, so the weights are proportional to exp(y / 50 px^2): the largest residuals count most.
+    Parameters as of `fit_variance_likelihood`; some y > 0.
+    """
+    log_weight = sq_residuals_px2 / (2.0 * INITIAL_SIGMA_PX**2)
+    root = np.exp(0.5 * (log_weight - log_weight.max()))
+    design = np.column_stack([np.ones_like(predictor_px2), predictor_px2])
+    theta, _ = optimize.nnls(root[:, None] * design, root * sq_residuals_px2)
+    return np.asarray(theta)
+
+
+def fit_variance_literal(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> VarianceFit:
+    """Fit (1) by the scoring steps of method.md section 2 from the paper's initial weights; for the reproduction only.
+
+    Parameters as of `fit_variance_likelihood`. The paper names the initial weights of its IRLS, 1 / p(eps | sigma = 5),
+    and not those of the later steps. Weights 1 / p at the current theta would grow without bound with the residual, so
+    the later steps are `audit.noise.scoring_step`. The start then decides only where the equation has several roots.
+    """
+    y, a_sq = sq_residuals_px2, predictor_px2
+    if y.size == 0 or not np.isfinite(y).all() or not y.any():
+        return UNDETERMINED
+    theta = previous = literal_start(y, a_sq)
+    for _ in range(_MAX_STEPS):
+        previous, theta = theta, scoring_step(y, a_sq, theta)
+        if not theta.any():  # the bulk is zero
+            return UNDETERMINED
+        new, old = theta[0] + theta[1] * a_sq, previous[0] + previous[1] * a_sq
+        if np.all(np.abs(new - old) <= _RELATIVE_CHANGE * old):
+            return VarianceFit(float(theta[0]), float(theta[1]), converged=True)
+    theta = 0.5 * (theta + previous)
+    return VarianceFit(float(theta[0]), float(theta[1]), converged=False)
