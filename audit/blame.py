@@ -16,12 +16,12 @@ from audit.misfit import (
     prepare_image,
     project_image,
 )
-from audit.misfit.basis import nuisance_basis, unit_columns
+from audit.misfit.basis import nuisance_transform
 from audit.misfit.outcome import not_tested
 from audit.multiplicity import benjamini_hochberg, holm
 from audit.refit import refit_points
 from audit.residuals import ModelResiduals
-from loaders.arrays import BoolArray, FloatArray
+from loaders.arrays import BoolArray, FloatArray, IntArray
 from loaders.model import CameraRecord, SparseModel
 
 _MIN_CLEAN_OBSERVATIONS = 20  # of points with at least two views that are not flagged
@@ -102,6 +102,27 @@ class Blame:
         )
 
 
+@dataclass(slots=True, eq=False)
+class _State:
+    """Where peeling stands; arrays are replaced, never written to.
+
+    tests: of each image, the last one.      untested: (I,) images whose last test is older than residuals_px.
+    flagged, residuals_px, clean: as in `Blame`.
+    """
+
+    tests: list[MisfitTests]
+    untested: BoolArray
+    flagged: BoolArray
+    residuals_px: FloatArray
+    clean: BoolArray
+
+    @classmethod
+    def initial(cls, tests: Sequence[MisfitTests], residuals_px: FloatArray) -> _State:
+        """Nobody is flagged."""
+        nobody = np.zeros(len(tests), dtype=bool)
+        return cls(list(tests), nobody, nobody, residuals_px, np.ones(residuals_px.shape[1], dtype=bool))
+
+
 class Peeling:
     """The images of one model, tested again and again while the guilty ones are taken out.
 
@@ -117,47 +138,74 @@ class Peeling:
         self._model, self._residuals, self._excluded = model, residuals, excluded
         self._alpha, self._tau_px = alpha, tau_px
         self._image_idx = np.repeat(np.arange(len(model.images)), np.diff(residuals.offsets))
+        self._transforms: dict[int, FloatArray] = {}  # of each image's N to its orthonormal basis, from its first use
 
     def run(self, tests: Sequence[MisfitTests]) -> Blame:
-        """Peel while it changes anything, test what is left and what was peeled; ``tests`` as the model stands."""
+        """Peel while it changes anything, test what is left and what was peeled; ``tests`` as the model stands.
+
+        Between two refits only suspects are tested again, the images whose last test would flag them: most images
+        that share points with a flagged one lose their misfit or never had any. When no suspect is left all others
+        are tested, and where that finds a new one peeling goes on, so that it ends where testing all images in every
+        round ends: no unflagged image has an effect that flags it.
+        """
         before = Significance.of(tests)
         effect, testable = before.effect_px(self._alpha), before.testable
         most_are_wrong = bool(2 * np.count_nonzero(effect > self._tau_px) > np.count_nonzero(testable))
         if most_are_wrong or not (effect > _FLAG_FROM_PX).any():
             return Blame.of_nobody(tests, self._residuals, most_are_wrong=most_are_wrong)
-        current, flagged = list(tests), np.zeros(len(tests), dtype=bool)
-        residuals, clean = self._residuals.residuals_px, flagged
+        state = _State.initial(tests, self._residuals.residuals_px)
         for _ in range(_MAX_ROUNDS):
-            effect = np.where(flagged, 0.0, Significance.of(current).effect_px(self._alpha))
-            guilty = (effect > _FLAG_FROM_PX) & (effect >= _SHARE_OF_LARGEST * effect.max(initial=0.0))
-            if not guilty.any() or np.count_nonzero(testable & ~flagged & ~guilty) < _MIN_UNFLAGGED:
+            guilty = self._guilty(state)
+            if not guilty.any():
+                self._test_all(state)
+                guilty = self._guilty(state)
+            if not guilty.any() or np.count_nonzero(testable & ~state.flagged & ~guilty) < _MIN_UNFLAGGED:
                 break
-            flagged |= guilty
-            residuals, moving, clean = self._without(flagged)
-            current = self._retest(current, flagged, tests, residuals, moving, clean)
-        if not flagged.any():
+            self._take_out(state, guilty, tests)
+        if not state.flagged.any():
             return Blame.of_nobody(tests, self._residuals, most_are_wrong=False)
-        for i in np.flatnonzero(flagged).tolist():  # against points that they had no say in
-            current[i] = self._test(i, residuals, clean)
+        self._test_all(state)
+        for i in np.flatnonzero(state.flagged).tolist():  # against points that they had no say in
+            state.tests[i] = self._test(i, state.residuals_px, state.clean)
         return Blame(
-            tuple(tests), before, tuple(current), Significance.of(current), flagged, residuals, clean, most_are_wrong
+            tuple(tests),
+            before,
+            tuple(state.tests),
+            Significance.of(state.tests),
+            state.flagged,
+            state.residuals_px,
+            state.clean,
+            most_are_wrong,
         )
 
-    def _retest(
-        self,
-        current: list[MisfitTests],
-        flagged: BoolArray,
-        stands: Sequence[MisfitTests],
-        residuals: FloatArray,
-        moving: BoolArray,
-        clean: BoolArray,
-    ) -> list[MisfitTests]:
-        """Test the unflagged images that share points with flagged ones; those keep the test that convicted them."""
-        out = list(current)
-        for i in np.flatnonzero(~flagged).tolist():
-            touched = moving[self._residuals.point_idx[self._residuals.rows(i)]].any()
-            out[i] = self._test(i, residuals, clean) if touched else stands[i]
-        return out
+    def _effect_px(self, state: _State) -> FloatArray:
+        """(I,) px, of the unflagged images by their last tests, 0 for flagged ones."""
+        return np.where(state.flagged, 0.0, Significance.of(state.tests).effect_px(self._alpha))
+
+    def _guilty(self, state: _State) -> BoolArray:
+        """(I,) images to take out next."""
+        effect = self._effect_px(state)
+        return np.asarray((effect > _FLAG_FROM_PX) & (effect >= _SHARE_OF_LARGEST * effect.max(initial=0.0)))
+
+    def _take_out(self, state: _State, guilty: BoolArray, stands: Sequence[MisfitTests]) -> None:
+        """Flag images, refit without them, test the suspects that share points with them; the others' tests are old."""
+        state.flagged = state.flagged | guilty
+        state.residuals_px, moving, state.clean = self._without(state.flagged)
+        touched = np.zeros(len(stands), dtype=bool)
+        touched[self._image_idx[moving[self._residuals.point_idx]]] = True
+        for i in np.flatnonzero(~state.flagged & ~touched).tolist():
+            state.tests[i] = stands[i]
+        state.untested = touched & ~state.flagged  # those keep the test that convicted them
+        self._test_some(state, self._effect_px(state) > _FLAG_FROM_PX)
+
+    def _test_all(self, state: _State) -> None:
+        self._test_some(state, state.untested)
+
+    def _test_some(self, state: _State, chosen: BoolArray) -> None:
+        """Test those of the chosen images whose test is older than the residuals."""
+        for i in np.flatnonzero(chosen & state.untested).tolist():
+            state.tests[i] = self._test(i, state.residuals_px, state.clean)
+        state.untested = state.untested & ~chosen
 
     def _without(self, flagged: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Residuals (2, n) refitted without the flagged images, points that moved, observations of clean points."""
@@ -166,24 +214,32 @@ class Peeling:
         has_say = kept[self._image_idx]
         moving = np.zeros(num_points, dtype=bool)
         moving[point_idx[~has_say]] = True
-        residuals = refit_points(self._residuals, num_points, kept, moving, self._basis, _MAX_SWEEPS)
+        residuals = refit_points(self._residuals, kept, moving, self._basis, _MAX_SWEEPS)
         clean = np.bincount(point_idx[has_say], minlength=num_points) >= _MIN_CLEAN_VIEWS
         return residuals, moving, clean[point_idx]
 
-    def _basis(self, image_idx: int) -> FloatArray:
-        """Orthonormal basis (q, 2, n) of what was fitted to the image."""
-        camera, xyz_cam = self._geometry(image_idx)
-        columns = nuisance_columns(camera.model, project_image(camera, xyz_cam))
-        basis = nuisance_basis(unit_columns(columns.reshape(len(columns), -1)))
-        return basis.reshape(len(basis), *columns.shape[1:])
+    def _basis(self, image_idx: int, rows: IntArray) -> FloatArray:
+        """Orthonormal basis of what was fitted to the image over all its inliers, (q, 2, m) at ``rows`` of them."""
+        transform = self._transforms.get(image_idx)
+        if transform is None:
+            columns = self._columns(image_idx, slice(None))
+            transform = nuisance_transform(columns.reshape(len(columns), -1))
+            self._transforms[image_idx] = transform
+            return np.tensordot(transform, columns[:, :, rows], axes=1)
+        return np.tensordot(transform, self._columns(image_idx, rows), axes=1)
 
-    def _geometry(self, image_idx: int) -> tuple[CameraRecord, FloatArray]:
-        """Camera and inlier points (n, 3) in its frame; images with inliers have a camera."""
+    def _columns(self, image_idx: int, rows: IntArray | slice) -> FloatArray:
+        """N (q, 2, m) of the image at ``rows`` of its inliers."""
+        camera, xyz_cam = self._geometry(image_idx, rows)
+        return nuisance_columns(camera.model, project_image(camera, xyz_cam))
+
+    def _geometry(self, image_idx: int, rows: IntArray | slice) -> tuple[CameraRecord, FloatArray]:
+        """Camera and points (m, 3) in its frame at ``rows`` of the inliers; images with inliers have a camera."""
         image = self._model.image(image_idx)
         if image.camera is None:
             raise ValueError(f"image {image.image_id} has inliers but no camera")
-        point_idx = self._residuals.point_idx[self._residuals.rows(image_idx)]
-        return image.camera, image.cam_from_world(self._model.points.xyz_world[point_idx])
+        point_idx = self._residuals.point_idx[self._residuals.rows(image_idx)][rows]
+        return image.camera, image.cam_from_world(self._model.points.xyz_world.take(point_idx, axis=0))
 
     def _test(self, image_idx: int, residuals_px: FloatArray, clean: BoolArray) -> MisfitTests:
         """Score tests of one image on residuals (2, n of the model), on its inliers of clean points."""
@@ -191,7 +247,7 @@ class Peeling:
         used = np.flatnonzero(clean[rows])
         if used.size < _MIN_CLEAN_OBSERVATIONS:
             return UNTESTED
-        camera, xyz_cam = self._geometry(image_idx)
-        xy_px = self._model.observations.xy_px[self._residuals.observation_row[rows][used]]
-        prepared = prepare_image(camera, xyz_cam[used], clusters=coincident_keypoints(xy_px))
-        return prepared.test(residuals_px[:, rows][:, used])
+        camera, xyz_cam = self._geometry(image_idx, used)
+        xy_px = self._model.observations.xy_px.take(self._residuals.observation_row[rows][used], axis=0)
+        prepared = prepare_image(camera, xyz_cam, clusters=coincident_keypoints(xy_px))
+        return prepared.test(residuals_px[:, rows].take(used, axis=1))

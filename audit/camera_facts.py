@@ -84,9 +84,11 @@ def camera_facts(
     error = math.nan
     if math.isfinite(sigma_px) and not known.parameters.is_singular:
         error = expected_error_map(camera, known.parameters, sigma_px, depth, rays=shape.rays).median_px
+    fields = candidate_fields(camera, projected)
+    prepared = prepare(columns, fields, clusters=coincident_keypoints(xy_px), overwrite_fields=True)
     return CameraFacts(
         shape,
-        prepare(columns, candidate_fields(camera, projected), clusters=coincident_keypoints(xy_px)).test(residuals_px),
+        prepared.test(residuals_px),
         known,
         error,
         coverage(xy_px, camera.width, camera.height),

@@ -189,7 +189,7 @@ class ModelAuditor:
             self.blame.final_tests[image_idx],
             self.blame.final.q[image_idx],
             self._xyz_cam(image_idx)[used],
-            self.blame.residuals_px[:, rows][:, used],
+            self.blame.residuals_px[:, rows].take(used, axis=1),
             float(self.sigma_constant_px[image_idx]),
             self.config,
         )

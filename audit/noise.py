@@ -54,11 +54,13 @@ def fit_constant_variance(sq_residuals_px2: FloatArray) -> VarianceFit:
     if n == 0 or not np.isfinite(total := float(y.sum())) or total == 0.0:
         return UNDETERMINED
     theta = total / (n * CONSISTENCY)  # below the root in u
+    unclipped, unclipped_sum = y, total
     for _ in range(_MAX_ITERATIONS):
-        inside = y < CUTOFF**2 * theta
-        num_clipped = n - int(np.count_nonzero(inside))
-        unclipped_sum = float(y.sum(where=inside)) if num_clipped else total
-        denominator = n * CONSISTENCY - num_clipped * CUTOFF**2
+        inside = unclipped < CUTOFF**2 * theta
+        if not inside.all():  # theta only falls: what is clipped stays clipped
+            unclipped = unclipped[inside]
+            unclipped_sum = float(unclipped.sum())
+        denominator = n * CONSISTENCY - (n - unclipped.size) * CUTOFF**2
         if denominator <= 0.0 or unclipped_sum == 0.0:  # positive outliers of a bulk that is zero: no root
             return UNDETERMINED
         previous, theta = theta, unclipped_sum / denominator
@@ -85,21 +87,23 @@ def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> Var
     """
     y = np.atleast_2d(sq_residuals_px2)
     constant = fit_constant_variance(y)
-    if not constant.converged or not predictor_px2.any():
+    if not constant.converged:
         return constant
-    theta = np.array([constant.detector_px2, 0.0])
-    equation, _ = _estimating_equation(y, predictor_px2, theta)
-    if equation[1] <= 0.0:
+    ends = np.array([predictor_px2.min(), predictor_px2.max()])
+    if ends[0] == ends[1]:
         return constant
-    if predictor_px2.min() > 0.0:
+    excess = _excess(y, np.full(1, constant.detector_px2))
+    if excess @ predictor_px2 <= 0.0:
+        return constant
+    if ends[0] > 0.0:
         proportional = fit_constant_variance(y / predictor_px2)
-        edge = np.array([0.0, proportional.detector_px2])
-        if proportional.converged and _estimating_equation(y, predictor_px2, edge)[0][0] <= 0.0:
+        scale = proportional.detector_px2 * predictor_px2
+        if proportional.converged and (_excess(y, scale) / scale).sum() <= 0.0:
             return VarianceFit(0.0, proportional.detector_px2, converged=True)
-    previous = theta
+    previous = theta = _first_step(excess, predictor_px2, constant.detector_px2, len(y))
     for _ in range(_MAX_ITERATIONS):
         previous, (theta, is_newton) = theta, _next_theta(y, predictor_px2, theta)
-        scale, old = _variance(predictor_px2, theta), _variance(predictor_px2, previous)
+        scale, old = _variance(ends, theta), _variance(ends, previous)  # s / s' is monotone in a^2
         tolerance = _NEWTON_CHANGE if is_newton else _RELATIVE_CHANGE
         if np.all(np.abs(scale - old) <= tolerance * old):
             return VarianceFit(float(theta[0]), float(theta[1]), converged=True)
@@ -111,20 +115,44 @@ def _variance(predictor: FloatArray, theta: FloatArray) -> FloatArray:
     return np.asarray(theta[0] + theta[1] * predictor, dtype=np.float64)
 
 
+def _excess(y: FloatArray, s: FloatArray) -> FloatArray:
+    """Return sum over the rows of min(y / s, c^2) / kappa - 1: (k, m) and (m,) or (1,) -> (m,)."""
+    return np.asarray(np.minimum(y / s, CUTOFF**2).sum(axis=0) / CONSISTENCY - len(y))
+
+
+def _first_step(excess: FloatArray, predictor: FloatArray, variance: float, num_rows: int) -> FloatArray:
+    """`scoring_step` from (variance, 0), where it is a straight line through equally weighted responses.
+
+    At that variance's own fixed point ``excess`` (m,) sums to 0, and where it grows with the predictor the line rises;
+    if it falls below 0 at a^2 = 0 it starts there instead.
+    """
+    mean = float(predictor.mean())
+    centred = predictor - mean
+    slope = variance * float(excess @ centred) / float(centred @ centred) / num_rows
+    if slope * mean <= variance:
+        return np.array([variance - slope * mean, slope])
+    response = variance * (1.0 + excess / num_rows)
+    return np.array([0.0, float(response @ predictor) / float(predictor @ predictor)])
+
+
 def _estimating_equation(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Left side (2,) of the estimating equation and its derivative (2, 2) in theta; y is (k, m), predictor (m,)."""
-    s = np.maximum(_variance(predictor, theta), np.finfo(np.float64).tiny)
-    inverse = 1.0 / s
-    clipped, unclipped = np.zeros_like(s), np.zeros_like(s)
-    for row in y:
-        ratio = np.minimum(row * inverse, CUTOFF**2)
-        clipped += ratio
-        unclipped += ratio * (ratio < CUTOFF**2)
-    first = (clipped / CONSISTENCY - len(y)) * inverse
-    slope = -(first + unclipped * inverse / CONSISTENCY) * inverse
+    inverse = 1.0 / np.maximum(_variance(predictor, theta), np.finfo(np.float64).tiny)
+    ratio = y * inverse
+    inside = ratio < CUTOFF**2
+    first = np.minimum(ratio, CUTOFF**2).sum(axis=0)
+    first *= 1.0 / CONSISTENCY
+    first -= len(y)
+    first *= inverse
+    ratio *= inside
+    slope = ratio.sum(axis=0)
+    slope *= inverse
+    slope *= 1.0 / CONSISTENCY
+    slope += first
+    slope *= inverse
     weighted = slope * predictor
-    cross = float(weighted.sum())
-    derivative = np.array([[slope.sum(), cross], [cross, weighted @ predictor]])
+    cross = -float(weighted.sum())
+    derivative = np.array([[-float(slope.sum()), cross], [cross, -float(weighted @ predictor)]])
     return np.array([first.sum(), first @ predictor]), derivative
 
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy import optimize
+from scipy import optimize, special
 
 from audit.noise import UNDETERMINED, VarianceFit, scoring_step
 from loaders.arrays import FloatArray
 
 INITIAL_SIGMA_PX: Final = 5.0  # of the paper's initial weights, px
-_SHARES: Final = 65  # of theta_2, among which the best bracket is looked for
-_SHARE_TOLERANCE: Final = 1e-10
+_LOG_ODDS: Final = np.linspace(-25.0, 25.0, 126)  # of theta_2's share, among which the best bracket is looked for
+_LOG_ODDS_TOLERANCE: Final = 1e-9
 _RELATIVE_CHANGE: Final = 1e-8
 _MAX_STEPS: Final = 100
 
@@ -32,8 +32,9 @@ def fit_variance_likelihood(sq_residuals_px2: FloatArray, predictor_px2: FloatAr
     -----
     Minimises sum (ln s_j + y_j / s_j) / 2, s = theta_1 + theta_2 a^2. With b_j = (1 - w) + w a_j^2 / mean a^2 and
     s = t b, the best t for a share w is mean(y / b): one bounded number is left, 0 <= w <= 1, whose profile may have
-    two minima. It is looked through before it is refined. A residual of exactly 0 at a^2 = 0 makes the likelihood
-    unbounded at theta_1 = 0: that end is left out where some a^2 = 0. All y = 0: undetermined.
+    several minima, also close to an end where a^2 spreads over decades. It is looked through, in steps of the log odds
+    of w, before it is refined. A residual of exactly 0 at a^2 = 0 makes the likelihood unbounded at theta_1 = 0: that
+    end is left out where some a^2 = 0. All y = 0: undetermined.
     """
     y, a_sq = sq_residuals_px2, predictor_px2
     if y.size == 0 or not np.isfinite(y).all() or not y.any():
@@ -49,12 +50,15 @@ def fit_variance_likelihood(sq_residuals_px2: FloatArray, predictor_px2: FloatAr
         b = shape(share)
         return float(np.log(np.mean(y / b)) + np.mean(np.log(b)))
 
-    end = 1.0 if a_sq.min() > 0.0 else 1.0 - 1.0 / _SHARES
-    shares = np.linspace(0.0, end, _SHARES)
-    best = int(np.argmin([cost(share) for share in shares.tolist()]))
-    low, high = shares[max(best - 1, 0)], shares[best + 1] if best + 1 < _SHARES else 1.0
-    found = optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": _SHARE_TOLERANCE})
-    ends = [0.0, float(found.x), *([1.0] if a_sq.min() > 0.0 else [])]
+    best = float(_LOG_ODDS[np.argmin([cost(float(special.expit(odds))) for odds in _LOG_ODDS])])
+    step = float(_LOG_ODDS[1] - _LOG_ODDS[0])
+    found = optimize.minimize_scalar(
+        lambda odds: cost(float(special.expit(odds))),
+        bounds=(best - step, best + step),
+        method="bounded",
+        options={"xatol": _LOG_ODDS_TOLERANCE},
+    )
+    ends = [0.0, float(special.expit(found.x)), *([1.0] if a_sq.min() > 0.0 else [])]
     share = min(ends, key=cost)
     scale = float(np.mean(y / shape(share)))
     return VarianceFit(scale * (1.0 - share), scale * share / float(a_sq.mean()), converged=bool(found.success))

@@ -46,7 +46,7 @@ class _System:
 
     def moved(self, point_step: FloatArray) -> FloatArray:
         """J dX: (3, p) -> (2, m)."""
-        return displacement(self.jacobian, point_step[:, self.point_row])
+        return displacement(self.jacobian, point_step.take(self.point_row, axis=1))
 
     def from_images(self, image_step: FloatArray) -> FloatArray:
         """Q c: (k, q) -> (2, m)."""
@@ -69,10 +69,9 @@ def displacement(jacobian: FloatArray, step: FloatArray) -> FloatArray:
 
 def refit_points(
     residuals: ModelResiduals,
-    num_points: int,
     kept: BoolArray,
     moving: BoolArray,
-    basis_of: Callable[[int], FloatArray],
+    basis_of: Callable[[int, IntArray], FloatArray],
     max_sweeps: int,
 ) -> FloatArray:
     """Return the residuals (2, n) of all inliers after the points that lost an image were triangulated again.
@@ -81,8 +80,8 @@ def refit_points(
     ----------
     residuals : of the model as it stands, px
     kept : (I,) images that keep their say        moving : (P,) points that may move; all others stay
-    basis_of : gives, for a kept image that sees a moving point, an orthonormal basis (q_i, 2, n_i) of the columns of
-        its own fitted parameters over its inliers
+    basis_of : gives, for a kept image and the m of its n_i inliers that see moving points, these (q_i, 2, m) of an
+        orthonormal basis (q_i, 2, n_i) of the columns of its own fitted parameters over all its inliers
     max_sweeps : bound on the sweeps over the observations
 
     Notes
@@ -95,39 +94,38 @@ def refit_points(
     rows = np.flatnonzero(touched & kept[image_idx])
     if not rows.size:
         return residuals.residuals_px
-    system = _build(residuals, num_points, rows, image_idx[rows], moving, basis_of)
-    eps = residuals.residuals_px[:, rows]
+    row_of_point = np.cumsum(moving) - 1
+    system = _build(residuals, rows, image_idx[rows], row_of_point, basis_of)
+    eps = residuals.residuals_px.take(rows, axis=1)
     first_step = system.point_step(eps)
     image_step = _conjugate_gradients(system, -system.to_images(system.moved(first_step)), max_sweeps)
     step = first_step - system.point_step(system.from_images(image_step))
     out = residuals.residuals_px.copy()
-    row_of_point = np.cumsum(moving) - 1
     affected = np.flatnonzero(touched)
     out[:, affected] -= displacement(
-        residuals.point_jacobian[:, :, affected], step[:, row_of_point[residuals.point_idx[affected]]]
+        residuals.point_jacobian.take(affected, axis=2), step.take(row_of_point[residuals.point_idx[affected]], axis=1)
     )
     return out
 
 
 def _build(
     residuals: ModelResiduals,
-    num_points: int,
     rows: IntArray,
     image_idx: IntArray,
-    moving: BoolArray,
-    basis_of: Callable[[int], FloatArray],
+    row_of_point: IntArray,
+    basis_of: Callable[[int, IntArray], FloatArray],
 ) -> _System:
     images, image_start, image_row = np.unique(image_idx, return_index=True, return_inverse=True)
     parts = []
     for start, stop, i in zip(image_start, [*image_start[1:], rows.size], images, strict=True):
-        parts.append(basis_of(int(i))[:, :, rows[start:stop] - residuals.offsets[i]])
+        parts.append(basis_of(int(i), rows[start:stop] - residuals.offsets[i]))
     basis = np.zeros((rows.size, 2, max(len(part) for part in parts)))
     for start, part in zip(image_start, parts, strict=True):
         basis[start : start + part.shape[2], :, : len(part)] = part.transpose(2, 1, 0)
-    jacobian = residuals.point_jacobian[:, :, rows]
-    inverse, _ = inverse_information(jacobian, residuals.point_idx[rows], num_points)
-    point_row = (np.cumsum(moving) - 1)[residuals.point_idx[rows]]
-    return _System(jacobian, point_row, basis, image_start, image_row, inverse[:, moving])
+    jacobian = residuals.point_jacobian.take(rows, axis=2)
+    point_row = row_of_point[residuals.point_idx[rows]]
+    inverse, _ = inverse_information(jacobian, point_row, int(row_of_point[-1]) + 1)
+    return _System(jacobian, point_row, basis, image_start, image_row, inverse)
 
 
 def _conjugate_gradients(system: _System, right: FloatArray, max_sweeps: int) -> FloatArray:

@@ -95,7 +95,7 @@ def model_tracks(
     if left_out.any():
         statistics = _replace_rows(statistics, kept, statistics_of(kept))
     used = statistics.verified & kept
-    sq = (statistics.whitened_px[:, used] ** 2).sum(axis=0)
+    sq = (statistics.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
     prior = fit_track_prior(sq, statistics.other_sq_px2[used], statistics.other_dof[used])
     standardiser = None
     if math.isfinite(prior.nu0):
@@ -137,7 +137,7 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
     rows = slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
     own = slice(int(tracks.verified_offsets[image_idx]), int(tracks.verified_offsets[image_idx + 1]))
     verified = statistics.verified[rows]
-    whitened = statistics.whitened_px[:, rows][:, verified]
+    whitened = statistics.whitened_px[:, rows].compress(verified, axis=1)  # rows of memory; [:, verified] has columns
     if tracks.standardiser is None or whitened.size == 0:
         empty = np.full(whitened.T.shape, math.nan)
         return ImageNoise(empty, sigma_constant_px, math.nan, math.nan, math.nan, math.nan, converged=False)

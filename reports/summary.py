@@ -6,8 +6,9 @@ Nothing is computed here that the tables do not hold: rows are picked, ordered, 
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from reports.drawing import Field, Listing, Page, draw
@@ -61,18 +62,93 @@ CAVEATS: Final = (
 )
 
 
+class _Smallest:
+    """The first ``limit`` rows in the order of a key, of any number that go by; as `heapq.nsmallest`, row by row."""
+
+    def __init__(self, limit: int, key: Callable[[Row], Any]) -> None:
+        self._limit, self._key = limit, key
+        self._rows: list[Row] = []
+
+    def add(self, row: Row) -> None:
+        """Look at one more row."""
+        self._rows.append(row)
+        if len(self._rows) >= 2 * self._limit + 100:
+            self._rows = self.rows()
+
+    def rows(self) -> list[Row]:
+        """Return the first rows so far, in order."""
+        return heapq.nsmallest(self._limit, self._rows, key=self._key)
+
+
+@dataclass(slots=True)
+class _Found:
+    """A finding code: how many findings, and the text of the one that comes first in the order of the models."""
+
+    count: int
+    order: Any
+    model: Row
+    text: str
+
+
+@dataclass(slots=True)
+class _Models:
+    """What the page needs of the table of models, which may be long: sums, and a few rows.
+
+    sums: of the counting columns.    first, worst: rows by name, and by share of rejected images.
+    """
+
+    num_models: int = 0
+    datasets: set[str] = field(default_factory=set)
+    sums: Counter[str] = field(default_factory=Counter)
+    num_stale: int = 0
+    findings: dict[str, _Found] = field(default_factory=dict)
+    first: _Smallest = field(default_factory=lambda: _Smallest(MAX_MODELS, _model_order))
+    worst: _Smallest = field(
+        default_factory=lambda: _Smallest(MAX_MODELS, lambda row: (-_share_rejected(row), _model_order(row)))
+    )
+
+    @classmethod
+    def read(cls, rows: Iterable[Row]) -> _Models:
+        """Go through the rows once; they may come in any order."""
+        models = cls()
+        for row in rows:
+            models.num_models += 1
+            models.datasets.add(row["dataset"])
+            models.sums.update({name: row[name] or 0 for name in MODEL_COLUMNS if name.startswith("num_")})
+            models.num_stale += (row["share_stale_point_errors"] or 0) > STALE_SHARE
+            models.first.add(row)
+            models.worst.add(row)
+            models._add_findings(row)
+        return models
+
+    def _add_findings(self, row: Row) -> None:
+        order = _model_order(row) if row["findings"] else None
+        for finding in row["findings"] or []:
+            found = self.findings.setdefault(finding["code"], _Found(0, order, row, finding["text"]))
+            found.count += 1
+            if order < found.order:
+                found.order, found.model, found.text = order, row, finding["text"]
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several data sets."""
+        return len(self.datasets) > 1
+
+
 def render_summary(run: RunReader, page: Page) -> str:
-    """Return the page as text; every line at most ``page.width`` cells wide (unless that is below 60)."""
-    models = sorted(run.rows("models", MODEL_COLUMNS), key=_model_order)
-    several = len({row["dataset"] for row in models}) > 1
+    """Return the page as text; every line at most ``page.width`` cells wide (unless that is below 60).
+
+    Tables are read part by part, and only what the page shows is kept: memory does not grow with the run.
+    """
+    models = _Models.read(run.rows("models", MODEL_COLUMNS))
     parts = [
         paragraph(_heading(run), page.width, "  "),
-        *_models_part(models, page, several=several),
+        *_models_part(models, page),
         *_verdicts_part(run, models, page),
-        *_images_part(run, models, page, several=several),
-        *_cameras_part(run, models, page, several=several),
+        *_images_part(run, models, page),
+        *_cameras_part(run, models, page),
     ]
-    parts += [*_findings_part(models, page, several=several), *_failures_part(run, page), *_closing(run, models, page)]
+    parts += [*_findings_part(models, page), *_failures_part(run, page), *_closing(run, models, page)]
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
 
 
@@ -83,13 +159,13 @@ def _heading(run: RunReader) -> str:
     return f"sfm-audit {run.info['version']}: {said}"
 
 
-def _models_part(models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
-    if not models:
+def _models_part(models: _Models, page: Page) -> list[str]:
+    if not models.num_models:
         return ["No model was audited."]
-    shown = list(models)
-    title = counted(len(models), "model")
-    if len(models) > MAX_MODELS:
-        shown = heapq.nsmallest(MAX_MODELS, models, key=lambda row: (-_share_rejected(row), _model_order(row)))
+    shown = models.first.rows()
+    title = counted(models.num_models, "model")
+    if models.num_models > MAX_MODELS:
+        shown = models.worst.rows()
         title += f"; the {MAX_MODELS} with the largest share of rejected images, all are in RUN/models"
     fields = [
         Field("images", lambda r: str(r["num_images"])),
@@ -101,19 +177,19 @@ def _models_part(models: Sequence[Row], page: Page, *, several: bool) -> list[st
         Field("noise\npx", lambda r: px(r["noise_s0_px"])),
         Field("find-\nings", lambda r: str(len(r["findings"] or [])), lambda r: "yellow" if r["findings"] else ""),
     ]
-    names = [[_model_name(row, several=several)] for row in shown]
+    names = [[_model_name(row, several=models.several)] for row in shown]
     return [draw(Listing(title, "model", names, shown), fields, page)]
 
 
-def _verdicts_part(run: RunReader, models: Sequence[Row], page: Page) -> list[str]:
+def _verdicts_part(run: RunReader, models: _Models, page: Page) -> list[str]:
     """Count every verdict, and the policy's, over all images."""
-    if not models:
+    if not models.num_models:
         return []
     policy = run.info["config"]["policy"]
     asked = [(f"_{member}", column, question) for member, (column, question) in VERDICTS.items()]
     asked.append(("", f"policy {policy}", POLICIES[policy]))
     rows: list[Row] = [
-        {**{v: sum(row[f"num_{v}{suffix}"] for row in models) for v in VERDICT_ORDER}, "question": question}
+        {**{v: models.sums[f"num_{v}{suffix}"] for v in VERDICT_ORDER}, "question": question}
         for suffix, _, question in asked
     ]
     fields = [
@@ -126,14 +202,14 @@ def _verdicts_part(run: RunReader, models: Sequence[Row], page: Page) -> list[st
     return [draw(Listing("Verdicts", "verdict", names, rows), fields, page)]
 
 
-def _images_part(run: RunReader, models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
-    total = sum(row["num_images"] for row in models)
+def _images_part(run: RunReader, models: _Models, page: Page) -> list[str]:
+    total = models.sums["num_images"]
     if total == 0:
         return []
-    limit = MAX_IMAGES_OF_ONE if len(models) == 1 else MAX_IMAGES_OF_MANY
+    limit = MAX_IMAGES_OF_ONE if models.num_models == 1 else MAX_IMAGES_OF_MANY
     rows = heapq.nsmallest(min(limit, total), run.rows("images", IMAGE_COLUMNS), key=_image_order)
     title = "Images" if len(rows) == total else "The worst images"
-    where = [[_model_name(row, several=several)] if len(models) > 1 else [] for row in rows]
+    where = [[_model_name(row, several=models.several)] if models.num_models > 1 else [] for row in rows]
     names = [[*model, plain(row["image_name"])] for row, model in zip(rows, where, strict=True)]
     fields = [
         Field(
@@ -159,59 +235,60 @@ def _images_part(run: RunReader, models: Sequence[Row], page: Page, *, several: 
     return [text, *reasons_part(run, page.width)]
 
 
-def _cameras_part(run: RunReader, models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
+def _cameras_part(run: RunReader, models: _Models, page: Page) -> list[str]:
     """List the cameras of several images that have, over all of them, a misfit that matters."""
-    found = [row for row in run.rows("cameras", CAMERA_COLUMNS) if row["num_images"] > 1 and row["misfit_material"]]
+    worst = _Smallest(MAX_LINES, lambda row: (-row["misfit_px"], _model_order(row), row["camera_id"]))
+    count = 0
+    for row in run.rows("cameras", CAMERA_COLUMNS):
+        if row["num_images"] > 1 and row["misfit_material"]:
+            worst.add(row)
+            count += 1
     lines = []
-    for row in sorted(found, key=lambda row: (-row["misfit_px"], _model_order(row), row["camera_id"])):
-        where = "" if len(models) == 1 else f"{shorten(_model_name(row, several=several), 30)} "
+    for row in worst.rows():
+        where = "" if models.num_models == 1 else f"{shorten(_model_name(row, several=models.several), 30)} "
         what = f"{row['camera_model']}, {row['num_images']} images: {row['misfit_group']} {number(row['misfit_px'])} px"
         advice = plain(row["advised_camera_model"] or "none")
         lines.append(paragraph(f"  {where}camera {row['camera_id']}  {what}; advice: {advice}", page.width, "    "))
-    return _limited("Shared cameras that do not fit, all their images together", lines, "RUN/cameras")
+    return _limited("Shared cameras that do not fit, all their images together", lines, "RUN/cameras", count)
 
 
-def _findings_part(models: Sequence[Row], page: Page, *, several: bool) -> list[str]:
+def _findings_part(models: _Models, page: Page) -> list[str]:
     """List what is inconsistent in the models; of a code that many models share, the first model's text."""
-    by_code: defaultdict[str, list[tuple[Row, Any]]] = defaultdict(list)
-    for row in models:
-        for finding in row["findings"] or []:
-            by_code[finding["code"]].append((row, finding))
     lines = []
-    for code, found in sorted(by_code.items(), key=lambda item: (-len(item[1]), item[0])):
-        row, finding = found[0]
-        where = "" if len(models) == 1 else f"{shorten(_model_name(row, several=several), 30)}: "
-        more = f" (and in {counted(len(found) - 1, 'other model')})" if len(found) > 1 else ""
-        lines.append(paragraph(f"  {code}  {where}{plain(finding['text'])}{more}", page.width, "    "))
-    return _limited("Findings: what is inconsistent in the models", lines, "RUN/models")
+    for code, found in sorted(models.findings.items(), key=lambda item: (-item[1].count, item[0])):
+        where = "" if models.num_models == 1 else f"{shorten(_model_name(found.model, several=models.several), 30)}: "
+        more = f" (and in {counted(found.count - 1, 'other model')})" if found.count > 1 else ""
+        lines.append(paragraph(f"  {code}  {where}{plain(found.text)}{more}", page.width, "    "))
+    return _limited("Findings: what is inconsistent in the models", lines, "RUN/models", len(lines))
 
 
 def _failures_part(run: RunReader, page: Page) -> list[str]:
     lines = [paragraph(f"  {plain(item['message'])}", page.width, "    ") for item in run.info.get("failures", [])]
-    return _limited("Not audited", lines, "RUN/run.json")
+    return _limited("Not audited", lines, "RUN/run.json", len(lines))
 
 
-def _limited(title: str, lines: Sequence[str], elsewhere: str) -> list[str]:
+def _limited(title: str, lines: Sequence[str], elsewhere: str, count: int) -> list[str]:
+    """Show the first of ``count`` lines, of which the first MAX_LINES at least are given."""
     if not lines:
         return []
-    rest = [f"  ... and {len(lines) - MAX_LINES} more, see {elsewhere}"] if len(lines) > MAX_LINES else []
+    rest = [f"  ... and {count - MAX_LINES} more, see {elsewhere}"] if count > MAX_LINES else []
     return ["\n".join([title, *lines[:MAX_LINES], *rest])]
 
 
-def _closing(run: RunReader, models: Sequence[Row], page: Page) -> list[str]:
+def _closing(run: RunReader, models: _Models, page: Page) -> list[str]:
     total, accepted, rejected, undetermined = (
-        sum(row[name] for row in models) for name in ("num_images", "num_accepted", "num_rejected", "num_undetermined")
+        models.sums[name] for name in ("num_images", "num_accepted", "num_rejected", "num_undetermined")
     )
     verdicts = f"{accepted} accepted, {rejected} rejected, {undetermined} undetermined"
     lines = [f"{counted(total, 'image')}: {verdicts}."]
     lines += [paragraph(f"- {text}", page.width, "  ") for text in CAVEATS]
-    stale = sum((row["share_stale_point_errors"] or 0) > STALE_SHARE for row in models)
+    stale = models.num_stale
     steps = []
     if stale:
         steps.append(f"Stored errors are not the points' errors in {counted(stale, 'model')}: do not filter by them.")
     if rejected:
         steps.append("Look at the rejected images before you train, measure or benchmark with them.")
-    moved = sum(row["num_nonstationary_images"] or 0 for row in models)
+    moved = models.sums["num_nonstationary_images"]
     if moved:
         limit = run.info["config"]["pose_offset_threshold_px"]
         what = "is" if moved == 1 else "are"

@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from scipy.linalg.blas import dgemm
 
 from loaders.arrays import FloatArray
 
 NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md section 5, step 1)
 FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection
 MAX_LEVERAGE: Final = 1.0 - 1e-9
-_CHUNK: Final = 512  # values per column and pass
 _SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, the exact path
 _SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
 _SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
@@ -68,17 +68,43 @@ def nuisance_basis(columns: FloatArray, *, exact: bool = False) -> FloatArray:
     return exact_basis(columns, NUISANCE_THRESHOLD * largest)
 
 
+def nuisance_transform(columns: FloatArray) -> FloatArray:
+    """Return T, (q', q), such that T N is an orthonormal basis of the columns N (q, m), as of `nuisance_basis`.
+
+    For those who need the basis at a few of the m values, several times.
+    """
+    norms = column_norms(columns)
+    used = np.flatnonzero(norms != 0)
+    unit = columns[used] / norms[used, None]
+    transform = np.zeros((0, 0))
+    if used.size:
+        values, vectors = np.linalg.eigh(unit @ unit.T)
+        if values[0] > _SMALLEST_PIVOT * values[-1]:
+            transform = (vectors / np.sqrt(values)).T
+            basis = transform @ unit
+            values, vectors = np.linalg.eigh(basis @ basis.T)
+            transform = (vectors / np.sqrt(values)).T @ transform
+        else:  # singular vectors: those kept, over their singular values
+            _, singular, rows = np.linalg.svd(np.linalg.qr(unit.T, mode="r"))
+            kept = singular > NUISANCE_THRESHOLD * singular[0]
+            transform = rows[kept] / singular[kept, None]
+    out = np.zeros((len(transform), len(columns)))
+    out[:, used] = transform / norms[used]
+    return out
+
+
 def project_off(basis: FloatArray, columns: FloatArray) -> FloatArray:
     """Return columns (..., m) minus their projections on an orthonormal basis (q, m)."""
     return np.asarray(columns - (columns @ basis.T) @ basis, dtype=np.float64)
 
 
 def project_off_in_place(basis: FloatArray, columns: FloatArray) -> FloatArray:
-    """Project columns (c, m) off an orthonormal basis (q, m), in place; return their coordinates on it before."""
+    """Project columns (c, m), in C order, off an orthonormal basis (q, m), in place; return their coordinates on it."""
+    if not columns.flags.c_contiguous:
+        raise ValueError("columns to project in place must be in C order")
     coordinates = columns @ basis.T
-    for start in range(0, basis.shape[1], _CHUNK):  # a small scratch array: fresh memory is dearer than arithmetic
-        part = slice(start, start + _CHUNK)
-        columns[:, part] -= coordinates @ basis[:, part]
+    if columns.size and basis.size:  # BLAS subtracts where they stand: fresh memory is dearer than arithmetic
+        dgemm(-1.0, basis.T, coordinates.T, 1.0, columns.T, overwrite_c=1)
     return np.asarray(coordinates)
 
 

@@ -20,10 +20,18 @@ _NO_TRANSFORM: Final = np.empty((0, 0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clusters:
-    """Observations that count as one in the meat: ``order`` (n,) sorts them, ``starts`` (K,) begin each cluster."""
+    """Observations that count as one in the meat; all others count by themselves.
 
-    order: IntArray
+    members: (k,) observations of clusters of two or more, by cluster.    starts: (c,) first member of each cluster.
+    """
+
+    members: IntArray
     starts: IntArray
+
+    @property
+    def num_merged(self) -> int:
+        """By how many the clusters are fewer than the observations."""
+        return len(self.members) - len(self.starts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +68,7 @@ class PreparedImage:
     @property
     def num_clusters(self) -> int:
         """Independent ones among them."""
-        return self.num_observations if self.clusters is None else len(self.clusters.starts)
+        return self.num_observations - (0 if self.clusters is None else self.clusters.num_merged)
 
     def test(self, residuals_px: FloatArray) -> MisfitTests:
         """Test residuals (2, n), observed minus projected, px, of the points the image was prepared with.
@@ -101,11 +109,17 @@ class PreparedImage:
         return np.asarray((along @ own).reshape(residuals_px.shape))
 
     def _per_cluster(self, weighted: FloatArray) -> FloatArray:
-        """(42, K): both rows of each point of fields * y / sqrt(1 - h), summed, then summed over clusters."""
-        g = np.einsum("cin,in->cn", self.fields, weighted)
-        if self.clusters is None:
-            return np.asarray(g)
-        return np.asarray(np.add.reduceat(g[:, self.clusters.order], self.clusters.starts, axis=1))
+        """(42, n): both rows of each point of fields * y / sqrt(1 - h), summed, then summed over clusters.
+
+        A cluster's sum stands at its first member; the others are zero, which adds nothing to the meat.
+        """
+        g = np.asarray(np.einsum("cin,in->cn", self.fields, weighted))
+        if self.clusters is not None:
+            members, starts = self.clusters.members, self.clusters.starts
+            sums = np.add.reduceat(g.take(members, axis=1), starts, axis=1)
+            g[:, members] = 0.0
+            g[:, members[starts]] = sums
+        return g
 
 
 def prepare_image(
@@ -131,6 +145,7 @@ def prepare(
     rows: IntArray | None = None,
     clusters: IntArray | None = None,
     exact: bool = False,
+    overwrite_fields: bool = False,
 ) -> PreparedImage:
     """Do all of the score test that does not need the residuals.
 
@@ -141,6 +156,7 @@ def prepare(
     rows : observations to use; all by default. Residuals and clusters are then those of these rows
     clusters : (n,) observations of equal number, >= 0, count as one in the meat; each counts by itself by default
     exact : never take the Gram path
+    overwrite_fields : whether ``fields`` may be used as scratch memory, which takes float64 in C order and no ``rows``
 
     Notes
     -----
@@ -152,7 +168,8 @@ def prepare(
     """
     if rows is not None:
         nuisance, fields = nuisance[:, :, rows], fields[:, :, rows]
-    return _prepare(nuisance, np.array(fields, dtype=np.float64, order="C"), clusters, exact=exact)
+    own = fields if overwrite_fields else np.array(fields, dtype=np.float64, order="C")
+    return _prepare(nuisance, own, clusters, exact=exact)
 
 
 def _prepare(nuisance: FloatArray, fields: FloatArray, clusters: IntArray | None, *, exact: bool) -> PreparedImage:
@@ -173,7 +190,7 @@ def _prepare(nuisance: FloatArray, fields: FloatArray, clusters: IntArray | None
         }
         return PreparedImage(np.empty((0, 2 * n)), np.empty((0, 2, n)), np.ones((2, n)), groups, clustered)
     q = basis.nuisance_basis(columns, exact=exact)
-    num_clusters = n if clustered is None else len(clustered.starts)
+    num_clusters = n - (0 if clustered is None else clustered.num_merged)
     groups = _project_fields(q, fields.reshape(len(fields), -1), num_clusters, exact=exact)
     leverage = np.minimum(np.einsum("qm,qm->m", q, q), basis.MAX_LEVERAGE)
     return PreparedImage(q, fields, (1.0 / np.sqrt(1.0 - leverage)).reshape(2, n), groups, clustered)
@@ -184,8 +201,11 @@ def _clusters_of(clusters: IntArray | None) -> Clusters | None:
     if clusters is None:
         return None
     order = np.argsort(clusters, kind="stable").astype(np.int64)
-    starts = np.flatnonzero(np.diff(clusters[order], prepend=-1)).astype(np.int64)
-    return None if len(starts) == len(clusters) else Clusters(order, starts)
+    is_start = np.diff(clusters[order], prepend=-1) != 0
+    has_twin = ~is_start | ~np.append(is_start[1:], True)
+    if not has_twin.any():
+        return None
+    return Clusters(order[has_twin], np.flatnonzero(is_start[has_twin]).astype(np.int64))
 
 
 def _project_fields(

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from audit import AuditConfig, ModelAuditor, audit_model
+from audit.blame import Peeling
+from audit.misfit.basis import nuisance_basis, nuisance_transform, unit_columns
 from audit.simulate.adjust import adjust_scene, sparse_model
 from audit.simulate.defects import DefectKind, DefectSpec
 from audit.simulate.noise import NoiseKind, NoiseSpec
@@ -39,6 +42,47 @@ def test_defective_images_are_found_and_their_neighbours_are_not_blamed(quarter)
     assert set(np.flatnonzero(blame.flagged)) >= set(WRONG)
     assert list(images.misfit_group[list(WRONG)]) == ["radial", "tangential", "affine", "rolling_shutter"]
     assert images.reasons[5][0].startswith("misfit_tangential: 0.")
+
+
+def test_testing_suspects_ends_where_testing_all_images_in_every_round_ends(monkeypatch):
+    sizes = zip(WRONG, (1.6, 0.7, 0.3, 0.3), strict=True)
+    model, _ = model_of(tuple(DefectSpec(i, DefectKind.RADIAL_K2, px) for i, px in sizes))
+    few, num_tests = ModelAuditor(model).blame, []
+    one_test, some = Peeling._test, Peeling._test_some
+    monkeypatch.setattr(Peeling, "_test", lambda *args: num_tests.append(args[1]) or one_test(*args))
+    again = ModelAuditor(model).blame
+    num_few = len(num_tests)
+    monkeypatch.setattr(Peeling, "_test_some", lambda self, state, _: some(self, state, np.ones_like(state.flagged)))
+    every = ModelAuditor(model).blame
+    assert num_few < 0.8 * (len(num_tests) - num_few)
+    assert (few.flagged == every.flagged).all()
+    for one, other in ((few, again), (few, every)):
+        assert_allclose(one.final.q, other.final.q, rtol=1e-12)
+        assert_allclose(one.final.px, other.final.px, rtol=1e-12)
+        assert (one.residuals_px == other.residuals_px).all()
+
+
+def test_what_peeling_leaves_unflagged_is_tested_against_the_final_points(quarter):
+    auditor = ModelAuditor(quarter[0])
+    blame = auditor.blame
+    peeling = Peeling(auditor.model, auditor.residuals, np.zeros(20, dtype=bool), alpha=0.05, tau_px=auditor.tau_px)
+    for i in range(20):
+        assert peeling._test(i, blame.residuals_px, blame.clean) == blame.final_tests[i]
+    assert (blame.final.effect_px(0.05)[~blame.flagged] <= 0.05).all()
+
+
+@pytest.mark.parametrize("shift", [1.0, 1e-3, 1e-7, 0.0])
+def test_transform_gives_the_nuisance_basis_also_of_nearly_and_of_fully_dependent_columns(shift):
+    """The same span as NumPy's and orthonormal; a column of zeros adds nothing."""
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(5, 80)) * np.geomspace(1e-3, 1e4, 5)[:, None]
+    columns[2] = 0.0
+    columns[4] = 7.0 * columns[1] + shift * rng.normal(size=80)
+    basis = nuisance_transform(columns) @ columns
+    expected = nuisance_basis(unit_columns(columns))
+    assert basis.shape == expected.shape == (np.linalg.matrix_rank(unit_columns(columns), tol=1e-9), 80)
+    assert_allclose(basis @ basis.T, np.eye(len(basis)), atol=1e-5 if shift == 1e-7 else 1e-9)
+    assert_allclose(np.abs(np.linalg.svd(basis @ expected.T, compute_uv=False)), 1.0, atol=1e-5)
 
 
 def test_peeling_recovers_the_size_of_the_effect(quarter):

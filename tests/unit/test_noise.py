@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import integrate, stats
 
-from audit.noise import CONSISTENCY, CUTOFF, fit_constant_variance, fit_variance, scoring_step
+from audit.noise import CONSISTENCY, CUTOFF, _excess, _first_step, fit_constant_variance, fit_variance, scoring_step
 
 
 def as_written(y, predictor, iterations=3000):
@@ -68,6 +68,24 @@ def test_two_parameter_fit_equals_the_iteration_as_written(seed):
     y = rng.normal(size=n) ** 2 * (rng.uniform(0, 0.3) + rng.uniform(0, 0.5) * predictor)
     fit, theta = fit_variance(y, predictor), as_written(y, predictor)
     assert_allclose([fit.detector_px2, fit.structure], theta, rtol=1e-5, atol=1e-6 * theta.sum())
+
+
+@pytest.mark.parametrize("power", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("rows", [1, 2])
+def test_the_first_step_is_the_scoring_step(power, rows):
+    """At power 3 the line falls below zero: both start at theta_1 = 0."""
+    rng = np.random.default_rng(rows)
+    predictor = rng.gamma(2.0, 1.0, 500)
+    y = rng.normal(size=(rows, 500)) ** 2 * predictor**power
+    variance = fit_constant_variance(y).detector_px2
+    step = _first_step(_excess(y, np.full(1, variance)), predictor, variance, rows)
+    assert_allclose(step, scoring_step(y, predictor, np.array([variance, 0.0])), rtol=1e-9)
+    assert (step[0] == 0.0) == (power == 3.0)
+
+
+def test_equal_predictors_are_a_constant():
+    y = np.random.default_rng(2).normal(size=(2, 50)) ** 2
+    assert fit_variance(y, np.full(50, 0.3)) == fit_constant_variance(y)
 
 
 def test_no_detector_noise_is_a_boundary_that_is_handled():

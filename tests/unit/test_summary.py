@@ -1,3 +1,4 @@
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -156,8 +157,8 @@ def test_remarks_are_not_told_as_reasons(run_folder):
 
 @pytest.mark.parametrize("code", ReasonCode)
 @pytest.mark.parametrize("verdict", Verdict)
-def test_two_codes_can_be_remarks(code, verdict):
-    wanted = code == ReasonCode.K1_NOT_IDENTIFIED or (
+def test_three_codes_can_be_remarks(code, verdict):
+    wanted = code in {ReasonCode.K1_NOT_IDENTIFIED, ReasonCode.FRONTO_PARALLEL} or (
         code == ReasonCode.MISFIT_NOT_TESTED and verdict != Verdict.UNDETERMINED
     )
     assert is_remark(str(code), {"verdict_misfit": str(verdict)}) == wanted
@@ -281,3 +282,41 @@ def test_numbers(text, wanted):
 
 def test_scene_9_comes_before_scene_10():
     assert sorted(["10", "9", "a10", "a9", ""], key=natural_key) == ["", "9", "10", "a9", "a10"]
+
+
+class Repeated(RunReader):
+    """The one model of a run, again and again under other names: rows as they are asked for, like those of files."""
+
+    times = 1
+
+    def rows(self, table, columns):
+        own = list(super().rows(table, columns))
+        for i in range(self.times):
+            for row in own:
+                name = {"scene": f"{i:05d}", "model_path": f"data/{i:05d}"}
+                yield row | {key: value for key, value in name.items() if key in row}
+
+
+def test_memory_does_not_grow_with_the_number_of_models(run_folder):
+    run = make_run(run_folder, 2, 3)
+    many = Repeated(run.folder, run.info)
+    peaks = []
+    for times in (200, 1200):
+        Repeated.times = times
+        tracemalloc.start()
+        try:
+            page = render_summary(many, Page(80))
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+        assert f"{2 * times} models; the {MAX_MODELS} with the largest share" in page
+        assert f"(and in {times - 1} other models)" in page
+    assert peaks[1] < 1.1 * peaks[0]
+
+
+def test_models_are_shown_in_the_order_of_their_names_whatever_the_order_of_the_parts(run_folder):
+    run = make_run(run_folder, MAX_MODELS, 1)
+    page = render_summary(run, Page(80))
+    places = [page.index(f"{i:04d}/0") for i in range(MAX_MODELS)]
+    assert places == sorted(places)
+    assert f"{FINDING.code} 0001/0: {FINDING.text} (and in 38 other models)" in " ".join(page.split())
