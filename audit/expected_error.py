@@ -100,10 +100,28 @@ def expected_error_map(
     with np.errstate(invalid="ignore", over="ignore"):
         xyz_cam = rays * depth if camera.model.is_spherical else rays * (depth / rays[:, 2:])
         jacobian = nuisance_columns(camera.model, project_image(camera, xyz_cam))
-        names = fitted_names(camera.model)
-        if len(parameters.names) < len(names):  # parameters without effect on the observations are not in there
-            jacobian = jacobian[[names.index(name) for name in parameters.names]]
-        by_pixel = jacobian.reshape(len(jacobian), -1)
-        variance = np.einsum("cm,cm->m", parameters.covariance @ by_pixel, by_pixel).reshape(2, -1).sum(axis=0)
-    error = np.sqrt(variance + 2.0 * sigma_px**2)
+        error = measurement_error_px(jacobian, fitted_names(camera.model), parameters, sigma_px)
     return ExpectedErrorMap(pixels, error.reshape(grid, grid))
+
+
+def measurement_error_px(
+    columns: FloatArray, names: tuple[str, ...], parameters: ParameterCovariance, sigma_px: float
+) -> FloatArray:
+    """Return (n,) px: sqrt(tr(J_theta C J_theta^T) + 2 sigma^2) at n points.
+
+    Parameters
+    ----------
+    columns : (q, 2, n) J_theta, px per unit, of the parameters ``names`` (q,)
+    parameters : their covariance; of those without effect on the observations it knows nothing
+    sigma_px : noise of a measurement per axis
+
+    Raises
+    ------
+    ValueError
+        when the covariance holds parameters that are not among the names.
+    """
+    if len(parameters.names) < len(names):
+        columns = columns[[names.index(name) for name in parameters.names]]
+    by_pixel = columns.reshape(len(columns), -1)
+    variance = np.einsum("cm,cm->m", parameters.covariance @ by_pixel, by_pixel).reshape(2, -1).sum(axis=0)
+    return np.asarray(np.sqrt(variance + 2.0 * sigma_px**2))

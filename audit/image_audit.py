@@ -201,11 +201,11 @@ def _judge(
         return Judgements(nothing, nothing, nothing, nothing)
     num_inliers = residuals_px.shape[1]
     exact = _exact(inliers, residuals_px)
-    no_ks = _too_few("standardised", len(noise.z), num_inliers, config) or exact or _no_noise(noise)
+    no_ks = _too_few("standardised", len(noise.z), num_inliers, config) or exact or no_noise(noise)
     ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha, min_distance=config.min_ks_distance)
     if no_ks is not None:
         ks = Judgement(Verdict.UNDETERMINED, (no_ks,))
-    limits = _limits(config)
+    limits = limits_of(config)
     if facts is None or opinion is None:
         nothing = Judgement(Verdict.UNDETERMINED, (_few("inliers", num_inliers, config),))
         return Judgements(ks, nothing, judge_pose(pose_offset_px, num_inliers, limits), nothing)
@@ -252,20 +252,27 @@ def _too_few(kind: str, num: int, num_inliers: int, config: AuditConfig) -> Reas
 
 
 def _exact(inliers: InlierSet, residuals_px: FloatArray) -> Reason | None:
-    """What makes the 2D points no measurements."""
-    camera, largest = inliers.image.camera, float(np.abs(residuals_px).max(initial=0.0))
-    if camera is not None and largest <= _EXACT_SHARE * max(camera.width, camera.height):
+    camera = inliers.image.camera
+    return None if camera is None else exact_projections(residuals_px, max(camera.width, camera.height))
+
+
+def exact_projections(residuals_px: FloatArray, longer_side_px: int) -> Reason | None:
+    """Say what makes the 2D points no measurements; None where they are."""
+    largest = float(np.abs(residuals_px).max(initial=0.0))
+    if largest <= _EXACT_SHARE * longer_side_px:
         return Reason(ReasonCode.EXACT_PROJECTIONS, f"largest residual {largest:.2g} px")
     return None
 
 
-def _no_noise(noise: ImageNoise) -> Reason | None:
+def no_noise(noise: ImageNoise) -> Reason | None:
+    """Say that nothing could be standardised; None where it could."""
     if np.isfinite(noise.z).all():
         return None
     return Reason(ReasonCode.NOISE_NOT_FITTED, f"{len(noise.z)} observations")
 
 
-def _limits(config: AuditConfig) -> PlausibilityLimits:
+def limits_of(config: AuditConfig) -> PlausibilityLimits:
+    """Return the thresholds of `audit.plausibility` that a config sets."""
     return PlausibilityLimits(
         min_focal_over_size=config.min_focal_over_size,
         max_focal_over_size=config.max_focal_over_size,

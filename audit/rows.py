@@ -53,8 +53,8 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         "noise_model": noise_name,
         **_noise_columns(audit),
         **_test_columns(audit),
-        **_misfit_columns(facts.misfit if facts else None),
-        **_cause_columns(audit.opinion.misfit if audit.opinion else None),
+        **misfit_columns(facts.misfit if facts else None),
+        **cause_columns(audit.opinion.misfit if audit.opinion else None),
         "advised_camera_model": audit.opinion.advised_camera_model if audit.opinion else None,
         "pose_offset_px": audit.pose_offset_px,
         **_camera_columns(facts),
@@ -130,7 +130,7 @@ def _test_columns(audit: ImageAudit) -> Row:
     }
 
 
-def _misfit_columns(tests: MisfitTests | None) -> Row:
+def misfit_columns(tests: MisfitTests | None) -> Row:
     """Return p, px and rank of every group; the rank only where it is known."""
     row: Row = {}
     for group in GROUPS:
@@ -141,7 +141,8 @@ def _misfit_columns(tests: MisfitTests | None) -> Row:
     return row
 
 
-def _cause_columns(misfit: Misfit | None) -> Row:
+def cause_columns(misfit: Misfit | None) -> Row:
+    """Return the named cause, its effect and q."""
     return {
         "misfit_group": str(misfit.group) if misfit and misfit.group else None,
         "misfit_px": misfit.px if misfit else math.nan,
@@ -175,8 +176,8 @@ def camera_row(audit: CameraAudit, labels: ModelLabels) -> Row:
         "num_images": len(audit.image_idxs),
         "num_points3d": audit.num_points,
         "num_observations": audit.num_observations,
-        **_misfit_columns(audit.misfit.tests),
-        **_cause_columns(audit.misfit),
+        **misfit_columns(audit.misfit.tests),
+        **cause_columns(audit.misfit),
         "advised_camera_model": audit.advised_camera_model,
         "misfit_material": bool(audit.misfit.material),
     }

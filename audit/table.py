@@ -13,6 +13,8 @@ import pyarrow as pa
 from audit.arrow import build_table
 
 __all__ = [
+    "CALIBRATION",
+    "CALIBRATION_RESIDUALS",
     "CAMERAS",
     "IMAGES",
     "MODELS",
@@ -26,12 +28,12 @@ __all__ = [
     "schema",
 ]
 
-TableName = Literal["images", "cameras", "models", "observations"]
+TableName = Literal["images", "cameras", "models", "observations", "calibration", "calibration_residuals"]
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: ``unit`` is px, count, id, text, bool, or 1 for a pure number; ``meaning`` is one line for people."""
+    """One column: ``unit`` is px, deg, count, id, text, bool or 1 (a pure number); ``meaning`` is one line."""
 
     name: str
     type: pa.DataType
@@ -98,7 +100,7 @@ _GROUPS: Final = {
 }
 
 
-def _misfit() -> tuple[Column, ...]:
+def _misfit_groups() -> tuple[Column, ...]:
     out = []
     for group, words in _GROUPS.items():
         out += [
@@ -106,8 +108,12 @@ def _misfit() -> tuple[Column, ...]:
             _px(f"misfit_{group}_px", f"RMS length of the field of {words} in the residuals, cleaned of noise"),
             _count(f"misfit_{group}_rank", "free columns of the group; 0: the camera model has it already"),
         ]
+    return tuple(out)
+
+
+def _misfit() -> tuple[Column, ...]:
     return (
-        *out,
+        *_misfit_groups(),
         _text("misfit_group", "named cause among the significant groups; for images after peeling"),
         _px("misfit_px", "effect of misfit_group"),
         _number("misfit_q", "q-value of misfit_group: Holm over the groups, Benjamini-Hochberg over the model"),
@@ -253,11 +259,102 @@ OBSERVATIONS: Final[tuple[Column, ...]] = (
     _number("z_y", "standardised residual under noise_model of the image; null where its track cannot verify it"),
 )
 
+CALIBRATION: Final[tuple[Column, ...]] = (
+    _text("correspondences", "location of the correspondences as given"),
+    _text("model", "estimator and model: D1, D3, pnprf, colmap"),
+    _text(
+        "distortion", "forward: distorted = undistorted (1 + k1 r^2 ...); division: undistorted = distorted / (1 + ...)"
+    ),
+    _text("camera_model", "COLMAP's name of the same camera; null where COLMAP has none"),
+    Column("params", _list_of(pa.float64()), "px and 1", "parameters of camera_model, in COLMAP's order"),
+    _texts("estimated", "parameters that were estimated beside the pose; f moves fx and fy alike"),
+    Column("width", pa.uint32(), "px", "image width"),
+    Column("height", pa.uint32(), "px", "image height"),
+    _px("fx_px", "focal length in x"),
+    _px("fy_px", "focal length in y"),
+    _px("cx_px", "principal point; the centre of the first pixel is 0.5"),
+    _px("cy_px", "principal point; the centre of the first pixel is 0.5"),
+    _number("k1", "first coefficient of the distortion; which way it acts says distortion"),
+    _number("k2", "second coefficient of the distortion"),
+    _number("k3", "third coefficient of the distortion"),
+    Column("rotation_cam_from_world", _list_of(pa.float64()), "1", "nine numbers, row by row"),
+    Column("translation_cam_from_world", _list_of(pa.float64()), "model units", "three numbers"),
+    _count("num_correspondences", "correspondences given"),
+    _count("num_inliers", "correspondences that the estimator kept; all that follows is about them"),
+    _px("rms_px", "root mean square reprojection error, sqrt(mean |eps|^2)"),
+    _px("mean_px", "mean reprojection error |eps|"),
+    _px("quartile1_px", "first quartile of the reprojection error |eps|"),
+    _px("quartile3_px", "third quartile of the reprojection error |eps|"),
+    _bool("olsson_accepts", "baseline, Olsson's rule: mean_px lies between quartile1_px and quartile3_px"),
+    _text("noise_model", "noise model behind z: constant or lidar"),
+    _px("sd_px", "empirical standard deviation per axis, sqrt(mean eps^2), x and y pooled"),
+    _px("sd_predicted_px", "what the noise model predicts for sd_px: root mean square of its standard deviations"),
+    _px("sigma_constant_px", "robust noise per axis, one value for the whole image"),
+    _px("sigma_d_px", "detector noise per axis, sqrt(theta_1) of the paper's model"),
+    _number("sigma_l", "lidar noise in steps to the scan's neighbours, sqrt(theta_2) of the paper's model"),
+    _bool("noise_converged", "whether the robust fits of the noise converged"),
+    _number("ks_stat", "Kolmogorov-Smirnov distance of z from N(0, 1)"),
+    _number("ks_p", "p-value of ks_stat; the paper's decision is at 0.05"),
+    _number("ks_fitted_p", "p-value of the same distance after centring and scaling z (Lilliefors' null)"),
+    _number("ks_norm_p", "p-value of |z|^2 against the Rayleigh law, scale fitted (Lilliefors' exponential null)"),
+    _number("ks_norm_unscaled_p", "p-value of |z|^2 / 2 against Exp(1), nothing fitted"),
+    _number("dap_stat", "D'Agostino-Pearson statistic of z"),
+    _number("dap_p", "p-value of dap_stat"),
+    _number("sw_stat", "Shapiro-Wilk statistic of z"),
+    _number("sw_p", "p-value of sw_stat"),
+    _number("skewness", "skewness of z; 0 for a normal"),
+    _number("kurtosis_excess", "excess kurtosis of z; 0 for a normal, positive for heavy tails"),
+    _texts("tests_rejecting", "which of KS, DAP, SW have p < alpha"),
+    _px("sd_plain_px", "sd_predicted_px under the plain scale: maximum likelihood, not robust"),
+    _number("ks_plain_stat", "Kolmogorov-Smirnov distance under the plain scale, which hides tails"),
+    _number("ks_plain_p", "p-value of ks_plain_stat"),
+    _number("dap_plain_p", "dap_p under the plain scale"),
+    _number("sw_plain_p", "sw_p under the plain scale"),
+    *_misfit_groups(),
+    _text("misfit_group", "named cause among the significant groups"),
+    _px("misfit_px", "effect of misfit_group"),
+    _number("misfit_q", "p-value of misfit_group, Holm over the groups that ran"),
+    _px("tau_px", "effect below which a significant misfit does not reject"),
+    _px("pose_offset_px", "RMS residual that a change of the pose alone would remove; ~0 at an optimum"),
+    _px("sd_focal_px", "standard deviation of the (first) focal length, the 3D points taken as exact"),
+    _number("sd_focal_rel", "largest sd_f / f, the 3D points taken as exact"),
+    _number("sd_k1", "standard deviation of k1, the 3D points taken as exact"),
+    _number("correlation_focal_depth", "correlation of the focal length with the distance; +-1: not told apart"),
+    _number("singular_share", "smallest / largest singular value of the unit Jacobian columns; ~0: ill-conditioned"),
+    _number("planarity", "smallest / largest singular value of the centred 3D points; 0: on a plane"),
+    Column("plane_tilt_deg", pa.float64(), "deg", "angle of the points' plane with the image; 0: fronto-parallel"),
+    _number("coverage", "area of the convex hull of the observed inliers / image area, not clipped"),
+    _count("occupied_cells", "cells with at least one inlier, of an 8 x 8 grid over the image"),
+    _number("focal_over_size", "first focal length / max(width, height)"),
+    _bool("folds_over", "whether the distortion folds inside the image"),
+    _px("expected_error_px", "expected error of a measurement with this camera, median over a 16 x 16 grid"),
+    _text("verdict", "accepted, rejected or undetermined under the policy"),
+    _text("verdict_ks", "rejected when ks_p < alpha"),
+    _text("verdict_misfit", "rejected when a group has p < alpha (Holm) and an effect above tau_px"),
+    _text("verdict_pose", "rejected when pose_offset_px is above its threshold"),
+    _text("plausible", "rejected when this cannot be a camera, undetermined when the points say too little of it"),
+    _texts("reasons", "why not accepted, and remarks: code, colon, and the number that triggered it"),
+)
+
+CALIBRATION_RESIDUALS: Final[tuple[Column, ...]] = (
+    Column("model", _CODED_TEXT, "text", "estimator and model, as in calibration"),
+    Column("correspondence_idx", pa.int64(), "id", "position among the correspondences as given, from 0"),
+    _bool("is_inlier", "whether the estimator kept it"),
+    _px("x_px", "observed; the centre of the first pixel is 0.5"),
+    _px("y_px", "observed; the centre of the first pixel is 0.5"),
+    _px("residual_x_px", "observed - projected; null where the camera does not see the point"),
+    _px("residual_y_px", "observed - projected; null where the camera does not see the point"),
+    _number("z_x", "standardised residual under noise_model; null for outliers"),
+    _number("z_y", "standardised residual under noise_model; null for outliers"),
+)
+
 TABLES: Final[dict[TableName, tuple[Column, ...]]] = {
     "images": IMAGES,
     "cameras": CAMERAS,
     "models": MODELS,
     "observations": OBSERVATIONS,
+    "calibration": CALIBRATION,
+    "calibration_residuals": CALIBRATION_RESIDUALS,
 }
 
 

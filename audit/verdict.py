@@ -42,6 +42,8 @@ class ReasonCode(StrEnum):
     K1_NOT_IDENTIFIED = "k1_not_identified"
     LOW_COVERAGE = "low_coverage"
     FEW_OCCUPIED_CELLS = "few_occupied_cells"
+    FRONTO_PARALLEL = "fronto_parallel"
+    DEGENERATE_INPUT = "degenerate_input"
 
 
 REASON_MEANINGS: dict[ReasonCode, str] = {
@@ -69,6 +71,8 @@ REASON_MEANINGS: dict[ReasonCode, str] = {
     ReasonCode.K1_NOT_IDENTIFIED: "|k1| is below two of its standard deviations (decides nothing): k1 and its sd",
     ReasonCode.LOW_COVERAGE: "the inliers see too little of the image: share of their convex hull",
     ReasonCode.FEW_OCCUPIED_CELLS: "the inliers lie in too few cells of the image: how many, and how many are needed",
+    ReasonCode.FRONTO_PARALLEL: "the points lie in a plane nearly parallel to the image: tilt, correlation of f",
+    ReasonCode.DEGENERATE_INPUT: "the correspondences determine no camera: in which way, and the number that says so",
 }
 
 

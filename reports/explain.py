@@ -55,6 +55,8 @@ _WORDS: Final = {
     "k1_not_identified": "its points do not fix the distortion ({detail})",
     "low_coverage": "its points see too little of the image ({detail})",
     "few_occupied_cells": "its points lie in too few parts of the image ({detail} cells)",
+    "fronto_parallel": "its points lie in a plane that is nearly parallel to the image ({detail})",
+    "degenerate_input": "its points determine no camera ({detail})",
 }
 REASON_CODES: Final = frozenset(_WORDS)
 QUESTIONS: Final = {

@@ -11,13 +11,13 @@ from reports.wording import counted, paragraph, plain, shorten
 
 REASON_COLUMNS: Final = ("image_name", "verdict_misfit", "advised_camera_model", "reasons")
 MAX_ADVICE: Final = 3
-_REMARK: Final = "k1_not_identified"
+_REMARKS: Final = frozenset({"k1_not_identified", "fronto_parallel"})
 _NOT_TESTED: Final = "misfit_not_tested"  # a reason where no lens group ran, a remark everywhere else
 
 
 def is_remark(code: str, row: Row) -> bool:
     """Whether a reason code decides nothing in this image (docs/verdicts.md)."""
-    return code == _REMARK or (code == _NOT_TESTED and row["verdict_misfit"] != "undetermined")
+    return code in _REMARKS or (code == _NOT_TESTED and row["verdict_misfit"] != "undetermined")
 
 
 @dataclass(slots=True)

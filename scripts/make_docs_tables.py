@@ -29,6 +29,13 @@ HEADERS = {
     ),
     "observations": "One row per inlier of an image, only with `--observations`.",
     "models": "One row per model. docs/findings.md explains the findings.",
+    "calibration": (
+        "One row per estimator, in the file `calibration.parquet` of `sfm-audit calibrate -o` (docs/calibrate.md).\n"
+        "Where the correspondences determine no camera nearly everything is null; `reasons` says why."
+    ),
+    "calibration_residuals": (
+        "One row per correspondence and estimator, in the file `residuals.parquet` of `sfm-audit calibrate -o`."
+    ),
 }
 CONFIG_INTRODUCTION = """# Settings
 
@@ -142,6 +149,8 @@ REASON_EFFECTS = {
     ReasonCode.K1_NOT_IDENTIFIED: ("`plausible`", "remark"),
     ReasonCode.LOW_COVERAGE: ("`plausible`", "undetermined"),
     ReasonCode.FEW_OCCUPIED_CELLS: ("`plausible`", "undetermined"),
+    ReasonCode.FRONTO_PARALLEL: ("`plausible` of `calibrate`", "remark"),
+    ReasonCode.DEGENERATE_INPUT: ("all four of `calibrate`", "undetermined"),
 }
 
 

@@ -19,7 +19,12 @@ from loaders.model import CameraRecord
 
 _REAL: Final = 1e-9  # imaginary share of a root that counts as real
 _FIRST_REACH: Final = 2.0  # normalised radius, 63 degrees
+_FARTHEST: Final = 1e6  # normalised radius that is 90 degrees for all purposes
 _MAX_DOUBLINGS: Final = 40
+_NEWTON_STEPS: Final = 7
+_NEWTON_CHANGE: Final = 1e-14  # relative, of the last step
+
+_Function = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 class Distortion(StrEnum):
@@ -68,6 +73,17 @@ class CalibratedCamera:
             return None
         params = np.array([*self.focal_px, *centre, self.coefficients[0]])
         return CameraRecord(1, BY_NAME["DIVISION"], self.width, self.height, params)
+
+    @property
+    def fold_radius(self) -> float:
+        """Undistorted normalised radius beyond which the image runs back, or that has no image; inf without one."""
+        if self.distortion is Distortion.FORWARD:
+            return _forward_fold(self.coefficients)
+        k = self.coefficients
+        fold = _first_root([1.0, -k[0], -3.0 * k[1], -5.0 * k[2]])
+        if not fold < _first_root([1.0, *k]):  # the polynomial falls to 0 first: all of the half space has an image
+            return float(np.inf)
+        return float(fold / _polynomial(k, np.array(fold)))
 
     def project(self, xyz_cam: FloatArray) -> ProjectedImage:
         """Project points (n, 3) in the camera frame, with derivatives.
@@ -158,26 +174,57 @@ def _slope(k: FloatArray, r: FloatArray) -> FloatArray:
 
 def _invert(k: FloatArray, r_distorted: FloatArray) -> FloatArray:
     """Solve r p(r) = r_distorted for r before the fold; NaN where there is none."""
-    fold = _first_root([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2]])
-    return _root_before(fold, lambda r, target: r * _polynomial(k, r) - target, r_distorted)
+
+    def g(r: FloatArray, target: FloatArray) -> FloatArray:
+        return r * _polynomial(k, r) - target
+
+    def slope(r: FloatArray, _: FloatArray) -> FloatArray:
+        return _polynomial(k, r) + r * _slope(k, r)
+
+    return _root_before(_forward_fold(k), g, slope, r_distorted)
 
 
 def _invert_division(k: FloatArray, r_undistorted: FloatArray) -> FloatArray:
     """Solve r = r_undistorted p(r) for r before the fold; NaN where there is none."""
+
+    def g(r: FloatArray, target: FloatArray) -> FloatArray:
+        return r - target * _polynomial(k, r)
+
+    def slope(r: FloatArray, target: FloatArray) -> FloatArray:
+        return 1.0 - target * _slope(k, r)
+
     fold = _first_root([1.0, -k[0], -3.0 * k[1], -5.0 * k[2]])  # of d/dr (r / p) = (p - r p') / p^2
     pole = _first_root([1.0, *k])
-    return _root_before(min(fold, pole), lambda r, target: r - target * _polynomial(k, r), r_undistorted)
+    return _root_before(min(fold, pole), g, slope, r_undistorted)
+
+
+def _forward_fold(k: FloatArray) -> float:
+    """Radius where d/dr (r p) = 0."""
+    return _first_root([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2]])
 
 
 def _first_root(coefficients: list[float]) -> float:
-    """Smallest r > 0 where a polynomial in r^2, lowest power first, is zero; inf without one."""
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.asarray(coefficients), "b"))
-    real = roots.real[(np.abs(roots.imag) < _REAL * np.abs(roots)) & (roots.real > 0.0)]
-    return float(np.sqrt(real.min(initial=np.inf)))
+    """Smallest r > 0 where a polynomial in r^2, 1 first, lowest power first, is zero; inf without one below 1e6."""
+    roots = np.polynomial.polynomial.polyroots(coefficients[::-1])  # in 1 / r^2: the leading coefficient is 1
+    real = roots.real[(np.abs(roots.imag) < _REAL * np.abs(roots)) & (roots.real > _FARTHEST**-2)]
+    return float(1.0 / np.sqrt(real.max())) if real.size else float(np.inf)
 
 
-def _root_before(end: float, g: Callable[[FloatArray, FloatArray], FloatArray], target: FloatArray) -> FloatArray:
+def _root_before(end: float, g: _Function, slope: _Function, target: FloatArray) -> FloatArray:
     """Solve g(r, target) = 0, rising from g <= 0 at 0, for 0 <= r <= end; NaN where it stays below 0."""
+    out = target.copy()
+    with np.errstate(all="ignore"):  # Newton may leave the domain: such points are bracketed below
+        for _ in range(_NEWTON_STEPS):
+            out -= g(out, target) / slope(out, target)
+        step = g(out, target) / slope(out, target)
+        found = (np.abs(step) <= _NEWTON_CHANGE * out) & (out >= 0.0) & (out < end)
+    if not found.all():
+        out[~found] = _bracketed_root_before(end, g, target[~found])
+    return out
+
+
+def _bracketed_root_before(end: float, g: _Function, target: FloatArray) -> FloatArray:
+    """`_root_before` where Newton does not get there: slower, but safe."""
     upper = np.full_like(target, min(end, _FIRST_REACH))
     for _ in range(_MAX_DOUBLINGS):
         short = (g(upper, target) < 0.0) & (upper < end)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
@@ -80,11 +81,16 @@ def estimate_of(
     correspondences: Correspondences,
     inliers: BoolArray,
 ) -> Estimate:
-    """Complete an estimate: residuals of all correspondences, covariance from the inliers' robust scale."""
+    """Complete an estimate: residuals of all correspondences, covariance from the inliers' robust scale.
+
+    The scale is that of the noise: the residuals' times 2 n / (2 n - q), for the q fitted parameters.
+    """
     xyz_cam = correspondences.xyz_world @ rotation_cam_from_world.T + translation_cam_from_world
     projected = camera.project(xyz_cam)
     residuals = correspondences.xy_px - projected.xy_px.T
     columns = np.concatenate([projected.pose, projected.d_params])[:, :, inliers]
-    sigma_px = float(np.sqrt(fit_constant_variance(residuals[inliers] ** 2).detector_px2))
+    num_free = columns[0].size - len(columns)
+    variance_px2 = fit_constant_variance(residuals[inliers] ** 2).detector_px2
+    sigma_px = math.sqrt(variance_px2 * columns[0].size / num_free) if num_free > 0 else math.nan
     covariance = parameter_covariance(columns, (*POSE_NAMES, *camera.estimated), sigma_px)
     return Estimate(name, camera, rotation_cam_from_world, translation_cam_from_world, inliers, residuals, covariance)

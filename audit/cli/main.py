@@ -19,6 +19,8 @@ VERBS: Final = {
     "learn-band": "Learn what repeated reconstructions differ by, as a gate file.",
     "diff": "Show what changed between two runs.",
     "filter": "Write lists, models and benchmark files without the rejected images.",
+    "calibrate": "Estimate cameras from 2D-3D correspondences and validate each.",
+    "simulate": "Write 2D-3D correspondences with known truth.",
     "demo": "Audit simulated photos with planted defects; needs no data.",
 }
 

@@ -48,19 +48,20 @@ def misfit_groups(row: Mapping[str, Any], *, tau_px: float | None = None, alpha:
     at = np.arange(len(MISFIT_GROUPS))
     for i, value in enumerate(size):
         if not known[i]:
-            axes.annotate("not tested", (0.0, i), va="center", color=MUTED, fontsize=7, **_BESIDE)
+            why = "the model has it" if row.get(f"misfit_{MISFIT_GROUPS[i]}_rank") == 0 else "not tested"
+            axes.annotate(why, (0.0, i), va="center", color=MUTED, fontsize=7, **_BESIDE)
             continue
         sure = p[i] is not None and p[i] < alpha
         axes.barh(i, value, height=0.65, color=BLUE if sure else "none", edgecolor=BLUE, linewidth=0.8)
-        axes.annotate(f"{value:.2f}", (value, i), va="center", fontsize=7, color=INK, **_BESIDE)
+        label = f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
+        axes.annotate(label, (value, i), va="center", fontsize=7, color=INK, **_BESIDE)
     if tau_px is not None and np.isfinite(tau_px):
         axes.axvline(tau_px, color=VERMILION, linewidth=1.0, linestyle="--")
         axes.text(tau_px, -0.75, f"matters above {tau_px:.2g}", color=VERMILION, fontsize=7, ha="center", va="bottom")
     axes.set_yticks(at, [group.replace("_", " ") for group in MISFIT_GROUPS])
     axes.set_ylim(len(MISFIT_GROUPS) - 0.4, -0.8)
-    axes.set_xlim(
-        0.0, 1.2 * max([value for value, there in zip(size, known, strict=True) if there] + [tau_px or 0.0, 0.05])
-    )
+    least = tau_px if tau_px is not None and tau_px > 0 and np.isfinite(tau_px) else 0.05
+    axes.set_xlim(0.0, 1.2 * max([value for value, there in zip(size, known, strict=True) if there] + [least]))
     axes.set_xlabel(f"systematic residual, px RMS (hollow: p > {alpha:g})")
     return figure
 

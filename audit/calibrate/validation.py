@@ -1,0 +1,274 @@
+"""Does an estimated camera hold, and do the correspondences determine it? (method.md sections 2, 4, 5, 6, 7)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from audit.calibrate.estimate import DegenerateInputError, Estimate
+from audit.calibrate.evidence import (
+    PlaneGeometry,
+    expected_error_of,
+    fronto_parallel_reason,
+    identifiability_of,
+    plane_geometry,
+    plausibility_of,
+)
+from audit.calibrate.lens_misfit import misfit_tests
+from audit.calibrate.lidar import lidar_noise, lidar_predictors
+from audit.config import AuditConfig
+from audit.coverage import coverage, occupied_cells
+from audit.expected_error import ExpectedErrorMap
+from audit.identifiability import Identifiability
+from audit.image_audit import Judgements, exact_projections, limits_of, no_noise
+from audit.misfit import GROUPS, MisfitTests
+from audit.misfit_verdict import Misfit, find_misfit, judge_misfit
+from audit.multiplicity import holm
+from audit.normality import NormalityTests, normality_tests
+from audit.plausibility import CameraPlausibility, judge_plausible, judge_pose
+from audit.standardise import ImageNoise, constant_noise
+from audit.stationarity import pose_offset_px
+from audit.verdict import Judgement, Reason, ReasonCode, Verdict, judge_ks
+from loaders.arrays import FloatArray
+from loaders.correspondences import Correspondences
+
+NoiseChoice = Literal["auto", "constant", "lidar"]
+
+DEFAULTS: Final = AuditConfig(noise="constant", points="independent", min_effect="0.5sigma")
+"""Thresholds of a validation. Corner detectors are good to 0.03 px, where 0.2 px would let every wrong lens pass."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandardisedResiduals:
+    """Residuals of the inliers under one scale.
+
+    noise: z (n, 2) and its scale; rows of z are NaN where a neighbour in the scan has no image.
+    sd_px: RMS of the predicted standard deviations, px.    tests: of the other rows of z.
+    """
+
+    noise: ImageNoise
+    sd_px: float
+    tests: NormalityTests
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """What is known of one estimate; everything is about its inliers.
+
+    noise_name: constant or lidar.    xy_px, residuals_px: (n, 2) observed, and observed - projected.
+    sd_px: empirical, per axis, sqrt(mean eps^2).    robust, plain: under the robust and under the plain scale.
+    misfit: q is Holm's p.            tau_px: effect that matters.    expected_error: conditional on the points.
+    """
+
+    estimate: Estimate
+    noise_name: str
+    xy_px: FloatArray
+    residuals_px: FloatArray
+    sd_px: float
+    robust: StandardisedResiduals
+    plain: StandardisedResiduals
+    sigma_constant_px: float
+    misfit: Misfit
+    tau_px: float
+    pose_offset_px: float
+    geometry: PlaneGeometry
+    plausibility: CameraPlausibility
+    identifiability: Identifiability
+    coverage: float
+    occupied_cells: int
+    expected_error: ExpectedErrorMap
+    judgements: Judgements
+    judgement: Judgement
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict of the policy."""
+        return self.judgement.verdict
+
+    @property
+    def error_quartiles_px(self) -> tuple[float, float]:
+        """First and third quartile of the reprojection distance |eps|."""
+        first, third = np.quantile(np.hypot(*self.residuals_px.T), (0.25, 0.75))
+        return float(first), float(third)
+
+    @property
+    def olsson_accepts(self) -> bool:
+        """Baseline (method.md section 8): the mean distance lies between its first and third quartile."""
+        first, third = self.error_quartiles_px
+        return bool(first <= np.hypot(*self.residuals_px.T).mean() <= third)
+
+
+def validate(
+    estimate: Estimate,
+    correspondences: Correspondences,
+    *,
+    noise: NoiseChoice = "auto",
+    config: AuditConfig = DEFAULTS,
+) -> Validation:
+    """Ask of an estimate all that the auditor asks of an image of a reconstruction.
+
+    Parameters
+    ----------
+    noise : ``lidar`` needs the points' neighbours in the scan; ``auto`` is lidar where there are any, else constant
+    config : thresholds and policy; its ``noise`` and ``points`` are not used: the points are independent of the image
+
+    Raises
+    ------
+    ValueError
+        ``lidar`` without neighbours, or an estimate without inliers.
+
+    Notes
+    -----
+    One image: q of the misfit groups is Holm's p. N of the score test is exactly what was estimated. Residuals of the
+    estimate need not be at its least squares optimum; to first order the test does not see the difference.
+    Standard deviations, expected error and the fields of the misfit test take the points as exact: noise of the lidar
+    is in the residuals' variance, which the test leaves free.
+    """
+    kept = estimate.inliers
+    if not kept.any():
+        raise ValueError(f"{estimate.name}: an estimate without inliers")
+    xy_px, xyz_cam = correspondences.xy_px[kept], estimate.xyz_cam(correspondences.xyz_world[kept])
+    residuals_px = np.ascontiguousarray(estimate.residuals_px[kept].T)
+    constant = constant_noise(residuals_px)
+    noise_name = noise if noise != "auto" else "lidar" if correspondences.has_neighbours else "constant"
+    robust, plain = _standardised(estimate, correspondences, constant, noise_name)
+    projected = estimate.camera.project(xyz_cam)
+    tau_px = config.tau_px(constant.sigma_constant_px)
+    tests = misfit_tests(estimate, correspondences, robust.noise if noise_name == "lidar" else None)
+    misfit = _misfit(tests, len(xy_px), constant.sigma_constant_px, tau_px, config)
+    offset = pose_offset_px(residuals_px, projected.pose[3:].transpose(1, 0, 2), xyz_cam.T)
+    camera = estimate.camera
+    found = _Evidence(
+        offset,
+        plane_geometry(xyz_cam),
+        plausibility_of(camera),
+        identifiability_of(estimate),
+        coverage(xy_px, camera.width, camera.height),
+        occupied_cells(xy_px, camera.width, camera.height, config.grid),
+    )
+    judgements = _judge(estimate, residuals_px, robust, misfit, found, config)
+    return Validation(
+        estimate,
+        noise_name,
+        xy_px,
+        residuals_px.T,
+        math.sqrt(float((residuals_px**2).mean())),
+        robust,
+        plain,
+        constant.sigma_constant_px,
+        misfit,
+        tau_px,
+        offset,
+        found.geometry,
+        found.plausibility,
+        found.identifiability,
+        found.coverage,
+        found.occupied_cells,
+        expected_error_of(estimate, correspondences, constant.sigma_constant_px),
+        judgements,
+        judgements.under(config.policy),
+    )
+
+
+def degenerate_judgement(error: DegenerateInputError) -> Judgement:
+    """Judge correspondences that determine no camera: undetermined, with the reason."""
+    detail = f"{error.degeneracy.value}, {error.detail}"
+    return Judgement(Verdict.UNDETERMINED, (Reason(ReasonCode.DEGENERATE_INPUT, detail),))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What `validate` and `_judge` share."""
+
+    pose_offset_px: float
+    geometry: PlaneGeometry
+    plausibility: CameraPlausibility
+    identifiability: Identifiability
+    coverage: float
+    occupied_cells: int
+
+
+def plain_constant_noise(residuals_px: FloatArray) -> ImageNoise:
+    """One maximum-likelihood scale for the residuals (2, n), which large residuals inflate."""
+    sigma = math.sqrt(float((residuals_px**2).mean()))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = residuals_px.T / sigma
+    return ImageNoise(z, sigma, sigma, math.nan, sigma, math.nan, converged=sigma > 0.0)
+
+
+def _standardised(
+    estimate: Estimate, correspondences: Correspondences, constant: ImageNoise, noise_name: str
+) -> tuple[StandardisedResiduals, StandardisedResiduals]:
+    """Residuals under the robust and under the plain scale of a noise model."""
+    if noise_name == "constant":
+        plain = plain_constant_noise(estimate.residuals_px[estimate.inliers].T)
+        return (
+            StandardisedResiduals(constant, constant.sigma_d_px, normality_tests(constant.z)),
+            StandardisedResiduals(plain, plain.sigma_d_px, normality_tests(plain.z)),
+        )
+    a_sq = lidar_predictors(estimate, correspondences)[estimate.inliers] ** 2
+    known = np.isfinite(a_sq).all(axis=1)  # a neighbour in the scan may have no image
+    found = []
+    for robust in (True, False):
+        noise = lidar_noise(estimate, correspondences, robust=robust)
+        variance = noise.sigma_d_px**2 + noise.sigma_l**2 * a_sq[known]
+        sd_px = math.sqrt(float(variance.mean())) if known.any() else math.nan
+        found.append(StandardisedResiduals(noise, sd_px, normality_tests(noise.z[known])))
+    return found[0], found[1]
+
+
+def _misfit(tests: MisfitTests, num_observations: int, sigma_px: float, tau_px: float, config: AuditConfig) -> Misfit:
+    adjusted = holm(np.array([tests[group].p for group in GROUPS]))
+    return find_misfit(
+        tests, adjusted, num_observations=num_observations, sigma_px=sigma_px, alpha=config.alpha, tau_px=tau_px
+    )
+
+
+def _judge(
+    estimate: Estimate,
+    residuals_px: FloatArray,
+    standardised: StandardisedResiduals,
+    misfit: Misfit,
+    found: _Evidence,
+    config: AuditConfig,
+) -> Judgements:
+    """Return all four verdicts of method.md section 7."""
+    num, limits = residuals_px.shape[1], limits_of(config)
+    blocked = _few(num, "inliers", config) or exact_projections(
+        residuals_px, max(estimate.camera.width, estimate.camera.height)
+    )
+    tests = standardised.tests
+    num_known = tests.num_values // 2
+    ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha, min_distance=config.min_ks_distance)
+    no_ks = blocked or (no_noise(standardised.noise) if math.isnan(tests.ks_p) else None)
+    no_ks = no_ks or _few(num_known, f"standardised of {num} inliers", config)
+    plausible = judge_plausible(
+        found.plausibility,
+        found.identifiability,
+        coverage=found.coverage,
+        occupied_cells=found.occupied_cells,
+        num_inliers=num,
+        limits=limits,
+    )
+    warning = fronto_parallel_reason(found.geometry, estimate)
+    if warning is not None:
+        plausible = Judgement(plausible.verdict, (*plausible.reasons, warning))
+    return Judgements(
+        _undetermined(no_ks) if no_ks else ks,
+        _undetermined(blocked) if blocked else judge_misfit(misfit),
+        judge_pose(found.pose_offset_px, num, limits),
+        plausible,
+    )
+
+
+def _few(num: int, what: str, config: AuditConfig) -> Reason | None:
+    if num >= config.min_observations:
+        return None
+    return Reason(ReasonCode.TOO_FEW_OBSERVATIONS, f"{num} {what}, {config.min_observations} needed")
+
+
+def _undetermined(reason: Reason) -> Judgement:
+    return Judgement(Verdict.UNDETERMINED, (reason,))
