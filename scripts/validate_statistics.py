@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=0, help="processes; --quick: 1, else all cores")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of validation.md and figures/")
     parser.add_argument(
-        "--keep", type=Path, help="folder of finished pieces, CSV files, from which a later run goes on"
+        "--keep", type=Path, help="folder of finished pieces, Parquet files, from which a later run goes on"
     )
     args = parser.parse_args()
     jobs = args.jobs or (1 if args.quick else os.cpu_count() or 1)

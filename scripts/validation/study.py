@@ -75,13 +75,13 @@ def _run(task: Task, keep: Path | None) -> pd.DataFrame:
     if keep is None:
         return task()
     name = f"{task.part} {task.function.__name__} {task.args!r}"
-    path = keep / f"{task.part}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.csv"
+    path = keep / f"{task.part}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.parquet"
     if not path.exists():
         keep.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(f".{os.getpid()}")
-        task().to_csv(part, index=False)
+        task().to_parquet(part, index=False)
         part.replace(path)
-    return pd.read_csv(path, keep_default_na=False, na_values=[""], float_precision="round_trip")
+    return pd.read_parquet(path)
 
 
 def _one_thread() -> None:
