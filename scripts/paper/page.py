@@ -251,6 +251,8 @@ def _tables(zhang: pd.DataFrame, rooms: pd.DataFrame) -> str:
         "predicted",
         *TEST_NAMES.values(),
         "misfit",
+        "few",
+        "refused",
         "paper's sd, rejecting",
     )
     rooms_intro = words.ROOMS.format(rooms=len(rooms) // (len(CAMERAS) * len(ROOM_MODELS)))

@@ -27,7 +27,10 @@ def percent(share: float) -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, first column to the left, the others to the right."""
+    """A Markdown table, first column to the left, the others to the right; ValueError for a row of another width."""
+    rows = [*rows]
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError(f"a row has not the {len(header)} columns of {', '.join(header)}")
     lines = ["| " + " | ".join(header) + " |", "|---|" + "---:|" * (len(header) - 1)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
