@@ -25,36 +25,30 @@ FILES: Final = frozenset({CALIBRATION_FILE, RESIDUALS_FILE, SUMMARY_FILE})
 MODELS: Final = ("D1", "D3", "pnprf", "colmap")
 
 
-class ModelList(click.ParamType[tuple[str, ...]]):
+def _models(_ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
     """Names of estimators, separated by commas, each once."""
-
-    name = "models"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Split and check."""
-        names = tuple(dict.fromkeys(part.strip() for part in str(value).split(",") if part.strip()))
-        unknown = [name for name in names if name not in MODELS]
-        if unknown or not names:
-            self.fail(f"expected some of {', '.join(MODELS)}, found {', '.join(unknown) or 'none'}", param, ctx)
-        return names
+    names = tuple(dict.fromkeys(part.strip() for part in value.split(",") if part.strip()))
+    unknown = [name for name in names if name not in MODELS]
+    if unknown or not names:
+        found = ", ".join(unknown) or "none"
+        raise click.BadParameter(f"expected some of {', '.join(MODELS)}, found {found}", param=param)
+    return names
 
 
-class MinEffect(click.ParamType[str]):
-    """A number with its unit, px or sigma."""
-
-    name = "TAU"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Check by the rule of the setting of the same name."""
-        try:
-            return AuditConfig(min_effect=str(value)).min_effect
-        except ValueError:
-            self.fail(f"expected a number with its unit, such as 0.2px or 0.5sigma, found {value!r}", param, ctx)
+def _min_effect(_ctx: click.Context, param: click.Parameter, value: str) -> str:
+    """A number with its unit, px or sigma, by the rule of the setting of the same name."""
+    try:
+        return AuditConfig(min_effect=value).min_effect
+    except ValueError as error:
+        wanted = "expected a number with its unit, such as 0.2px or 0.5sigma"
+        raise click.BadParameter(f"{wanted}, found {value!r}", param=param) from error
 
 
 @click.command("calibrate", short_help="Estimate cameras from 2D-3D correspondences and validate each.")
 @click.argument("correspondences", metavar="CORRESPONDENCES")
-@click.option("--models", type=ModelList(), default="D1,D3,pnprf", show_default=True, help="Also: colmap.")
+@click.option(
+    "--models", metavar="NAMES", callback=_models, default="D1,D3,pnprf", show_default=True, help="Also: colmap."
+)
 @click.option("--scan", metavar="SCAN.ptx", help="Gridded lidar scan to take each point's neighbours from.")
 @click.option("--image", metavar="PHOTO", type=click.Path(path_type=Path), help="Undistort it by each camera.")
 @click.option("--width", type=click.IntRange(min=1), help="Image width, px, where the file does not say it.")
@@ -69,7 +63,7 @@ class MinEffect(click.ParamType[str]):
 )
 @click.option("--points", type=click.Choice(["independent"]), default="independent", help="The only choice here.")
 @click.option("--alpha", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.05, show_default=True)
-@click.option("--min-effect", metavar="TAU", type=MinEffect(), default="0.5sigma", show_default=True)
+@click.option("--min-effect", metavar="TAU", callback=_min_effect, default="0.5sigma", show_default=True)
 @click.option("--policy", type=click.Choice(get_args(PolicyName)), default="full", show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of RANSAC's samples.")
 @click.option("-o", "--out", metavar="FOLDER", type=click.Path(path_type=Path), help="Tables and figures.")
