@@ -19,6 +19,7 @@ _SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, th
 _SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
 _SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
 _SAFE_SQUARE: Final = 1e-280  # sums of squares between this and its inverse lost nothing to under- or overflow
+_MODEST_SQUARE: Final = 1e-60  # the same for squares that are multiplied with each other and with those of residuals
 
 
 def unit_columns(columns: FloatArray) -> FloatArray:
@@ -34,11 +35,20 @@ def column_norms(columns: FloatArray) -> FloatArray:
     """Return the lengths of the columns (c, m), without overflow; NaN where a column is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.einsum("cm,cm->c", columns, columns)
-        if ((squares > _SAFE_SQUARE) & (squares < 1.0 / _SAFE_SQUARE)).all():
+        if _within(squares, _SAFE_SQUARE):
             return np.asarray(np.sqrt(squares))
         largest = np.abs(columns).max(axis=1, initial=0.0)
         divisor = np.where(largest > 0, largest, 1.0)
         return np.asarray(divisor * np.sqrt(np.sum((columns / divisor[:, None]) ** 2, axis=1)))
+
+
+def may_stay_unscaled(sq_norms: FloatArray) -> bool:
+    """Whether products of fields of these squared lengths with each other and with residuals cannot overflow."""
+    return _within(sq_norms, _MODEST_SQUARE)
+
+
+def _within(values: FloatArray, smallest: float) -> bool:
+    return bool(((values > smallest) & (values < 1.0 / smallest)).all())
 
 
 def exact_basis(columns: FloatArray, threshold: float) -> FloatArray:
@@ -108,12 +118,12 @@ def project_off_in_place(basis: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(coordinates)
 
 
-def field_transform(gram: FloatArray, largest_sq: float) -> FloatArray | None:
+def field_transform(gram: FloatArray, before: FloatArray) -> FloatArray | None:
     """Return W, (c, r), such that W^T E is orthonormal, from E's Gram matrix (c, c) after projection.
 
     Parameters
     ----------
-    largest_sq : the largest squared singular value of E *before* projection
+    before : Gram matrix (c, c) of E *before* projection
 
     Returns
     -------
@@ -121,7 +131,16 @@ def field_transform(gram: FloatArray, largest_sq: float) -> FloatArray | None:
         None where the Gram matrix cannot tell which directions exceed `FIELD_THRESHOLD`.
     """
     values, vectors = np.linalg.eigh(gram)
-    kept = values > _SURE_FIELD * largest_sq
-    if (values[~kept] > _SURE_NULL * largest_sq).any():
-        return None
+    upper = float(before.trace())  # the largest squared singular value lies between this / c and this
+    kept = values > _SURE_FIELD * upper
+    if (values[~kept] > _SURE_NULL * upper / len(values)).any():
+        largest = largest_sq(before)
+        kept = values > _SURE_FIELD * largest
+        if (values[~kept] > _SURE_NULL * largest).any():
+            return None
     return np.asarray(vectors[:, kept] / np.sqrt(values[kept]), dtype=np.float64)
+
+
+def largest_sq(gram: FloatArray) -> float:
+    """Return the largest squared singular value of the columns that have this Gram matrix."""
+    return float(np.linalg.eigvalsh(gram)[-1])

@@ -229,7 +229,7 @@ def _first_pass(
 def _largest_sq(normal: _Normal, group: MisfitGroup) -> float:
     """Largest squared singular value of a group before projection."""
     columns = normal.columns(group)
-    return float(np.linalg.eigvalsh(normal.before[columns, columns])[-1])
+    return basis.largest_sq(normal.before[columns, columns])
 
 
 def _solve_normal(normal: _Normal) -> _Solution | None:
@@ -248,8 +248,8 @@ def _solve_normal(normal: _Normal) -> _Solution | None:
     for group in GROUPS:
         if group in normal.refused:
             continue
-        columns = GROUP_COLUMNS[group]
-        transform = basis.field_transform(left[columns, columns], _largest_sq(normal, group))
+        columns, own = GROUP_COLUMNS[group], normal.columns(group)
+        transform = basis.field_transform(left[columns, columns], normal.before[own, own])
         if transform is None:
             return None
         transforms[group] = transform

@@ -83,17 +83,22 @@ class PreparedImage:
     def _tests(self, residuals_px: FloatArray) -> MisfitTests:
         y = basis.project_off(self.nuisance_basis, residuals_px.reshape(-1))
         scores = self.fields.reshape(len(self.fields), -1) @ y
-        per_cluster = self._per_cluster(y.reshape(2, -1) * self.inverse_root)
-        tests = {}
-        for name, group in self.groups.items():
-            if group.refused is not None:
-                tests[name] = group.refused
-                continue
-            g = per_cluster[group.columns]
-            meat = group.transform.T @ (g @ g.T) @ group.transform  # M = sum_k g_k g_k^T
-            s = group.transform.T @ scores[group.columns]
-            tests[name] = judged_by_f(s, meat, self.num_clusters, self.num_observations)
-        return tests
+        g = self._per_cluster(y.reshape(2, -1) * self.inverse_root)
+        transform, ranks = self._joined_transform()
+        meat = transform.T @ (g @ g.T) @ transform  # M = sum_k g_k g_k^T, of each group on the diagonal
+        judged = iter(judged_by_f(transform.T @ scores, meat, ranks, self.num_clusters, self.num_observations))
+        return {name: group.refused or next(judged) for name, group in self.groups.items()}
+
+    def _joined_transform(self) -> tuple[FloatArray, list[int]]:
+        """(42, R) transforms of the groups that can be tested, side by side, and their ranks."""
+        tested = [group for group in self.groups.values() if group.refused is None]
+        ranks = [group.transform.shape[1] for group in tested]
+        out = np.zeros((len(self.fields), sum(ranks)))
+        start = 0
+        for group, rank in zip(tested, ranks, strict=True):
+            out[group.columns, start : start + rank] = group.transform
+            start += rank
+        return out, ranks
 
     def explained_px(self, residuals_px: FloatArray, group: MisfitGroup) -> FloatArray:
         """Return (2, n) px, U U^T y: the group's share of the residuals, NaN where it is not tested.
@@ -211,12 +216,23 @@ def _clusters_of(clusters: IntArray | None) -> Clusters | None:
 def _project_fields(
     q: FloatArray, fields: FloatArray, num_clusters: int, *, exact: bool
 ) -> dict[MisfitGroup, PreparedGroup]:
-    """Scale fields (42, m) to unit length and project them off Q, in place; return each group's basis within them."""
-    norms = basis.column_norms(fields)
-    finite = np.isfinite(norms)
-    fields[~finite] = 0.0
-    fields *= (1.0 / np.where(finite & (norms > 0), norms, 1.0))[:, None]
-    on_nuisance = basis.project_off_in_place(q, fields)
+    """Project fields (42, m) off Q, in place; return each group's basis within them.
+
+    The unit length of step 1 enters with the transforms: their products are smaller than the fields.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        on_nuisance = basis.project_off_in_place(q, fields)
+        gram = fields @ fields.T
+        before = gram + on_nuisance @ on_nuisance.T
+        sq_norms = before.diagonal()
+    if basis.may_stay_unscaled(sq_norms):
+        finite = np.ones(len(fields), dtype=bool)
+        scale = 1.0 / np.sqrt(sq_norms)
+        gram, before = (product * scale * scale[:, None] for product in (gram, before))
+    else:
+        finite, scale = _scale_in_place(fields, on_nuisance), np.ones(len(fields))
+        gram = fields @ fields.T
+        before = gram + on_nuisance @ on_nuisance.T
     free_values = fields.shape[1] - len(q)
     groups = {}
     for group, columns in GROUP_COLUMNS.items():
@@ -227,24 +243,39 @@ def _project_fields(
             refused = not_tested(MisfitStatus.NOT_ENOUGH_EVIDENCE)
         transform = _NO_TRANSFORM
         if refused is None:
-            transform = _orthonormalise(q, fields[columns], on_nuisance[columns], exact=exact)
+            own_scale, own_before = scale[columns, None], before[columns, columns]
+            by_gram = None if exact else basis.field_transform(gram[columns, columns], own_before)
+            if by_gram is None:
+                fields[columns] *= own_scale
+                transform = _exactly(q, fields[columns], basis.largest_sq(own_before))
+            else:
+                transform = own_scale * by_gram
             refused = refusal(transform.shape[1], num_clusters)
         groups[group] = PreparedGroup(columns, transform, refused)
     return groups
 
 
-def _orthonormalise(q: FloatArray, own: FloatArray, on_nuisance: FloatArray, *, exact: bool) -> FloatArray:
-    """Return W, (c, r), such that W^T own is orthonormal; where that takes the exact path, ``own`` is replaced.
+def _scale_in_place(fields: FloatArray, on_nuisance: FloatArray) -> FloatArray:
+    """Scale projected fields (c, m) and their coordinates (c, q) to unit length before the projection, zero ones not.
 
-    The Gram path keeps singular values above 1e-5 only: what one projection leaves of Q is 1e-11 of them. The exact
-    path keeps smaller ones and projects twice.
+    Those that are not finite become zero; return (c,) which are finite.
     """
-    gram = own @ own.T
-    largest_sq = float(np.linalg.eigvalsh(gram + on_nuisance @ on_nuisance.T)[-1])  # of the fields before projection
-    transform = None if exact else basis.field_transform(gram, largest_sq)
-    if transform is None:
-        basis.project_off_in_place(q, own)
-        orthonormal = basis.exact_basis(own, basis.FIELD_THRESHOLD * math.sqrt(largest_sq))
-        own[: len(orthonormal)] = orthonormal
-        transform = np.eye(len(own))[:, : len(orthonormal)]
-    return transform
+    norms = basis.column_norms(np.hstack([fields, on_nuisance]))
+    finite = np.isfinite(norms)
+    divisor = np.where(finite & (norms > 0), norms, 1.0)[:, None]
+    for part in fields, on_nuisance:
+        part[~finite] = 0.0
+        np.divide(part, divisor, out=part)
+    return finite
+
+
+def _exactly(q: FloatArray, own: FloatArray, largest_sq: float) -> FloatArray:
+    """Replace a group's projected unit fields, (c, m), by an orthonormal basis; return which of them it takes.
+
+    The Gram path keeps singular values above 1e-5 only: what one projection leaves of Q is 1e-11 of them. This path
+    keeps smaller ones and projects twice.
+    """
+    basis.project_off_in_place(q, own)
+    orthonormal = basis.exact_basis(own, basis.FIELD_THRESHOLD * math.sqrt(largest_sq))
+    own[: len(orthonormal)] = orthonormal
+    return np.eye(len(own))[:, : len(orthonormal)]

@@ -204,11 +204,11 @@ def test_p_keeps_its_digits_in_the_tail():
     """For r = 2 the F tail is (1 - T / n)^((n - 2) / 2) exactly."""
     for n in (10, 250, 5000):
         for share in (1e-6, 0.1, 0.5, 0.9):
-            test = judged_by_f(np.array([math.sqrt(share * n), 0.0]), np.eye(2), n, n)
+            (test,) = judged_by_f(np.array([math.sqrt(share * n), 0.0]), np.eye(2), [2], n, n)
             exact = 0.5 * (n - 2) * math.log1p(-share)
             if exact > math.log(1e-300):
                 assert_allclose(math.log(test.p), exact, rtol=1e-11, atol=1e-13)
-    assert judged_by_f(np.array([math.sqrt(250.0), 0.0]), np.eye(2), 250, 250).p == 0.0
+    assert judged_by_f(np.array([math.sqrt(250.0), 0.0]), np.eye(2), [2], 250, 250)[0].p == 0.0
 
 
 def test_explained_field_has_the_length_of_the_scores():
