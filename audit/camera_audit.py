@@ -135,7 +135,7 @@ def audit_cameras(
 
 def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> Retest:
     if len(group.image_idxs) == 1:
-        return image_retest(*group.geometry(0))
+        return lambda camera: image_retest(*group.geometry(0))(camera)  # few are ever asked
     return lambda camera: group.tests(camera, rows, num_points).tests
 
 
@@ -158,14 +158,14 @@ def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float =
 
 
 def image_advice(
-    fact: CameraFacts, misfit: Misfit, xyz_cam: FloatArray, residuals_px: FloatArray, *, alpha: float, tau_px: float
+    fact: CameraFacts, misfit: Misfit, retest: Retest, *, alpha: float, tau_px: float
 ) -> str | None:
-    """Return the camera model that one image's points (n, 3) and residuals (2, n) ask for."""
+    """Return the camera model that one image asks for; ``retest`` of its points and residuals."""
     return advised_camera_model(
         fact.shape.camera,
         misfit.group if misfit.material else None,
         misfit.material,
-        retest=image_retest(xyz_cam, residuals_px),
+        retest=retest,
         distortion_identified=_distortion_identified([fact]),
         alpha=alpha,
         tau_px=tau_px,

@@ -17,6 +17,7 @@ from audit.camera_facts import CameraFacts, CameraShape, camera_facts
 from audit.config import AuditConfig
 from audit.image_audit import CameraOpinion, ImageAudit, Judgements, judged, opinion_of
 from audit.keypoint_noise import KeypointTracks, keypoint_noise, keypoint_tracks
+from audit.misfit import MisfitTests, image_retest
 from audit.misfit_verdict import shared_camera_reason
 from audit.multiplicity import benjamini_hochberg
 from audit.noise import fit_constant_variance
@@ -28,7 +29,7 @@ from audit.stored_errors import StoredErrors, compare_stored_errors, stale_findi
 from audit.table import ModelLabels, TableName, build_table, empty_table, schema
 from audit.verdict import Judgement, Reason, ReasonCode
 from loaders.arrays import FloatArray, IntArray
-from loaders.model import Finding, FindingCode, InlierSet, SparseModel
+from loaders.model import CameraRecord, Finding, FindingCode, InlierSet, SparseModel
 
 _REMOVABLE_SHARE = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
 
@@ -182,18 +183,24 @@ class ModelAuditor:
         fact = self.facts[image_idx]
         if fact is None:
             return None
-        rows = self.residuals.rows(image_idx)
-        used = np.flatnonzero(self.blame.clean[rows])
+        clean = self.blame.clean[self.residuals.rows(image_idx)]
         opinion = opinion_of(
             fact,
             self.blame.final_tests[image_idx],
             self.blame.final.q[image_idx],
-            self._xyz_cam(image_idx)[used],
-            self.blame.residuals_px[:, rows].take(used, axis=1),
+            int(np.count_nonzero(clean)),
+            partial(self._retest, image_idx),
             float(self.sigma_constant_px[image_idx]),
             self.config,
         )
         return replace(opinion, shared=self._shared_fault(image_idx)) if self.blame.most_are_wrong else opinion
+
+    def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
+        """The final tests of the image if it had been fitted with this camera, to first order."""
+        rows = self.residuals.rows(image_idx)
+        used = np.flatnonzero(self.blame.clean[rows])
+        residuals_px = self.blame.residuals_px[:, rows].take(used, axis=1)
+        return image_retest(self._xyz_cam(image_idx)[used], residuals_px)(camera)
 
     def _shared_fault(self, image_idx: int) -> Reason | None:
         """The reason that the image's camera as a whole is at fault, if several images share it and together say so."""

@@ -10,7 +10,7 @@ from audit.blame import Significance
 from audit.camera_audit import image_advice
 from audit.camera_facts import CameraFacts, CameraShape, camera_facts
 from audit.config import AuditConfig, PolicyName
-from audit.misfit import MisfitTests
+from audit.misfit import MisfitTests, Retest, image_retest
 from audit.misfit_verdict import Misfit, find_misfit, judge_misfit
 from audit.normality import NormalityTests, normality_tests
 from audit.plausibility import PlausibilityLimits, judge_plausible, judge_pose
@@ -129,8 +129,8 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
             facts,
             facts.misfit,
             Significance.of([facts.misfit]).q[0],
-            part.xyz_cam.T,
-            part.residuals_px,
+            len(rows),
+            image_retest(part.xyz_cam.T, part.residuals_px),
             sigma_px,
             config,
         )
@@ -141,16 +141,16 @@ def opinion_of(
     facts: CameraFacts,
     tests: MisfitTests,
     q: FloatArray,
-    xyz_cam: FloatArray,
-    residuals_px: FloatArray,
+    num_tested: int,
+    retest: Retest,
     sigma_px: float,
     config: AuditConfig,
 ) -> CameraOpinion:
-    """Form the opinion from the final tests, their q (6,), and the points (n, 3) and residuals (2, n) they used."""
+    """Form the opinion from the final tests, their q (6,), and the number and the retest of the inliers they used."""
     tau_px = config.tau_px(sigma_px)
-    misfit = find_misfit(tests, q, num_observations=len(xyz_cam), sigma_px=sigma_px, alpha=config.alpha, tau_px=tau_px)
-    advice = image_advice(facts, misfit, xyz_cam, residuals_px, alpha=config.alpha, tau_px=tau_px)
-    return CameraOpinion(misfit, advice, len(xyz_cam))
+    misfit = find_misfit(tests, q, num_observations=num_tested, sigma_px=sigma_px, alpha=config.alpha, tau_px=tau_px)
+    advice = image_advice(facts, misfit, retest, alpha=config.alpha, tau_px=tau_px)
+    return CameraOpinion(misfit, advice, num_tested)
 
 
 def judged(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from audit.cameras import project_with_jacobians
+from audit.cameras import project_columns
 from audit.stationarity import pose_offset_px
 from loaders.arrays import BoolArray, FloatArray, IntArray
 from loaders.model import CameraRecord, ImageRecord, SparseModel
@@ -104,11 +104,11 @@ def image_residuals(
 
 def _residuals(camera: CameraRecord, xy_px: FloatArray, xyz_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Observed minus projected (2, n) and the Jacobian (2, 3, n) in the camera frame."""
-    projection = project_with_jacobians(camera.model, camera.params, xyz_cam, with_params=False)
-    residuals = np.subtract(xy_px.T, projection.xy_px.T, order="C")
+    projection = project_columns(camera.model, camera.params, xyz_cam, with_params=False)
+    residuals = np.subtract(xy_px.T, projection.xy_px, order="C")
     if camera.model.is_spherical:
         residuals[0] -= camera.width * np.round(residuals[0] / camera.width)  # the seam is no edge
-    return residuals, np.ascontiguousarray(projection.d_xy_d_cam.transpose(1, 2, 0))
+    return residuals, projection.d_xy_d_cam
 
 
 def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:

@@ -13,6 +13,7 @@ from audit.cameras.projection import (
     is_fisheye,
     normalised,
     project,
+    project_columns,
     project_with_jacobians,
 )
 from audit.cameras.unprojection import unproject
@@ -23,6 +24,7 @@ __all__ = [
     "is_fisheye",
     "normalised",
     "project",
+    "project_columns",
     "project_with_jacobians",
     "unproject",
 ]

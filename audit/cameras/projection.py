@@ -31,6 +31,15 @@ class Projection:
     d_xy_d_params: FloatArray | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectionColumns:
+    """A `Projection` with points last, contiguous: xy_px (2, n), d_xy_d_cam (2, 3, n), d_xy_d_params (p, 2, n)."""
+
+    xy_px: FloatArray
+    d_xy_d_cam: FloatArray
+    d_xy_d_params: FloatArray | None
+
+
 def is_fisheye(model: CameraModel) -> bool:
     """Whether ``model`` distorts the equidistant plane theta (X, Y) / rho instead of (X, Y) / Z."""
     return model.name.endswith("FISHEYE")
@@ -66,7 +75,7 @@ def project(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> Floa
     """
     with np.errstate(all="ignore"):
         plane = _plane(model, params, xyz_cam, Want.VALUE)
-        return _finite_px(model, params, plane)[0]
+        return np.ascontiguousarray(_finite_px(model, params, plane)[0].T)
 
 
 def project_with_jacobians(
@@ -79,16 +88,29 @@ def project_with_jacobians(
     Some points project and have no finite derivative: the poles of EQUIRECTANGULAR, the rim of a division model
     (Z^2 = 4 k (X^2 + Y^2)), and points at infinity.
     """
+    found = project_columns(model, params, xyz_cam, with_params=with_params)
+    d_params = found.d_xy_d_params
+    return Projection(
+        np.ascontiguousarray(found.xy_px.T),
+        np.ascontiguousarray(found.d_xy_d_cam.transpose(2, 0, 1)),
+        None if d_params is None else np.ascontiguousarray(d_params.transpose(2, 1, 0)),
+    )
+
+
+def project_columns(
+    model: CameraModel, params: FloatArray, xyz_cam: FloatArray, *, with_params: bool = True
+) -> ProjectionColumns:
+    """Do what ``project_with_jacobians`` does, points last: for those who go on with one number of all points."""
     with np.errstate(all="ignore"):
         plane = _plane(model, params, xyz_cam, Want.D_EXTRA if with_params else Want.D_POINT)
         xy_px, lost = _finite_px(model, params, plane)
         d_cam = _d_cam(model, params, plane)
         d_params = _d_params(model, params, plane) if with_params else None
     if lost is not None:
-        d_cam[lost] = np.nan
+        d_cam[..., lost] = np.nan
         if d_params is not None:
-            d_params[lost] = np.nan
-    return Projection(xy_px, d_cam, d_params)
+            d_params[..., lost] = np.nan
+    return ProjectionColumns(xy_px, d_cam, d_params)
 
 
 def normalised(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
@@ -163,44 +185,38 @@ def _plane(model: CameraModel, params: FloatArray, xyz_cam: FloatArray, want: Wa
 
 
 def _finite_px(model: CameraModel, params: FloatArray, plane: Plane) -> tuple[FloatArray, IntArray | None]:
-    """Return (n, 2) px, NaN where not finite, and the rows where it is not (None when there is none)."""
+    """Return (2, n) px, NaN where not finite, and the points where it is not (None when there is none)."""
     fx, fy, cx, cy = scale_and_shift(model, params)
-    xy_px = np.empty((len(plane.x), 2))
-    np.add(plane.x * fx, cx, out=xy_px[:, 0])
-    np.add(plane.y * fy, cy, out=xy_px[:, 1])
+    xy_px = np.empty((2, len(plane.x)))
+    np.add(plane.x * fx, cx, out=xy_px[0])
+    np.add(plane.y * fy, cy, out=xy_px[1])
     if math.isfinite(xy_px.sum()):
         return xy_px, None
-    lost: IntArray = np.flatnonzero(~np.isfinite(xy_px).all(axis=1)).astype(np.int64)
-    xy_px[lost] = np.nan
+    lost: IntArray = np.flatnonzero(~np.isfinite(xy_px).all(axis=0)).astype(np.int64)
+    xy_px[:, lost] = np.nan
     return xy_px, lost
 
 
 def _d_cam(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
-    """Return (n, 2, 3) d px / d point."""
+    """Return (2, 3, n) d px / d point."""
     fx, fy, _, _ = scale_and_shift(model, params)
     d_cam = np.empty((2, 3, len(plane.x)))
     for axis in range(3):
         np.multiply(plane.d_cam[axis], fx, out=d_cam[0, axis])
         np.multiply(plane.d_cam[3 + axis], fy, out=d_cam[1, axis])
-    return _rows_first(d_cam)
+    return d_cam
 
 
 def _d_params(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
-    """Return (n, 2, p) d px / d params."""
+    """Return (p, 2, n) d px / d params."""
     fx, fy, _, _ = scale_and_shift(model, params)
-    d_params = np.empty((2, model.num_params, len(plane.x)))
-    d_params.fill(0.0)
+    d_params = np.zeros((model.num_params, 2, len(plane.x)))
     focals = (0, 1) if model.is_spherical else model.focal_idxs
-    d_params[0, focals[0]] = plane.x
-    d_params[1, focals[-1]] = plane.y
+    d_params[focals[0], 0] = plane.x
+    d_params[focals[-1], 1] = plane.y
     for row, idx in enumerate(model.principal_point_idxs):
-        d_params[row, idx] = 1.0
+        d_params[idx, row] = 1.0
     for idx, (d_x, d_y) in zip(model.extra_idxs, plane.d_extra, strict=True):
-        np.multiply(d_x, fx, out=d_params[0, idx])
-        np.multiply(d_y, fy, out=d_params[1, idx])
-    return _rows_first(d_params)
-
-
-def _rows_first(columns: FloatArray) -> FloatArray:
-    """Return (2, p, n) as a contiguous (n, 2, p): one copy is half the price of writing into strided columns."""
-    return np.ascontiguousarray(columns.transpose(2, 0, 1))
+        np.multiply(d_x, fx, out=d_params[idx, 0])
+        np.multiply(d_y, fy, out=d_params[idx, 1])
+    return d_params

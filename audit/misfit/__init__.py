@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from audit.misfit.cause import advised_camera_model, bic, extended_camera, image_retest, named_cause, remaining_groups
+from audit.misfit.cause import (
+    Retest,
+    advised_camera_model,
+    bic,
+    extended_camera,
+    image_retest,
+    named_cause,
+    remaining_groups,
+)
 from audit.misfit.clusters import coincident_keypoints
 from audit.misfit.fields import GROUPS, MisfitGroup, candidate_fields
 from audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
@@ -20,6 +28,7 @@ __all__ = [
     "PooledTests",
     "PreparedImage",
     "ProjectedImage",
+    "Retest",
     "advised_camera_model",
     "bic",
     "camera_tests",

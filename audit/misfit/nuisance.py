@@ -7,8 +7,8 @@ from typing import cast
 
 import numpy as np
 
-from audit.cameras import normalised, project_with_jacobians
-from audit.stationarity import pose_jacobian
+from audit.cameras import normalised, project_columns
+from audit.stationarity import pose_columns
 from loaders.arrays import FloatArray
 from loaders.camera_models import CameraModel
 from loaders.model import CameraRecord
@@ -34,13 +34,13 @@ class ProjectedImage:
 
 def project_image(camera: CameraRecord, xyz_cam: FloatArray) -> ProjectedImage:
     """Project the points (n, 3), in the camera frame, of one image; values are NaN where a point does not project."""
-    projection = project_with_jacobians(camera.model, camera.params, xyz_cam)
-    d_params = cast("FloatArray", projection.d_xy_d_params)
+    xyz_cam = np.asfortranarray(xyz_cam)  # each coordinate contiguous
+    projection = project_columns(camera.model, camera.params, xyz_cam)
     return ProjectedImage(
-        np.ascontiguousarray(projection.xy_px.T),
+        projection.xy_px,
         np.ascontiguousarray(normalised(camera.model, camera.params, xyz_cam).T),
-        np.ascontiguousarray(pose_jacobian(projection.d_xy_d_cam, xyz_cam).transpose(2, 1, 0)),
-        np.ascontiguousarray(d_params.transpose(2, 1, 0)),
+        pose_columns(projection.d_xy_d_cam, xyz_cam.T),
+        cast("FloatArray", projection.d_xy_d_params),
     )
 
 
