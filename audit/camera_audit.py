@@ -12,13 +12,14 @@ from audit.blame import Significance
 from audit.camera_facts import CameraFacts
 from audit.misfit import (
     ImageDesign,
+    MisfitTests,
     PooledTests,
+    Retest,
     advised_camera_model,
     camera_tests,
     image_design,
     image_retest,
 )
-from audit.misfit.cause import Retest
 from audit.misfit_verdict import Misfit, find_misfit
 from audit.residuals import ModelResiduals
 from loaders.arrays import FloatArray, IntArray
@@ -134,9 +135,14 @@ def audit_cameras(
 
 
 def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> Retest:
-    if len(group.image_idxs) == 1:
-        return lambda camera: image_retest(*group.geometry(0))(camera)  # few are ever asked
-    return lambda camera: group.tests(camera, rows, num_points).tests
+    """The geometry waits until it is asked, which happens to few cameras."""
+
+    def retest(camera: CameraRecord) -> MisfitTests:
+        if len(group.image_idxs) == 1:
+            return image_retest(*group.geometry(0))(camera)
+        return group.tests(camera, rows, num_points).tests
+
+    return retest
 
 
 def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float = 2.0) -> bool:
@@ -157,9 +163,7 @@ def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float =
     return False
 
 
-def image_advice(
-    fact: CameraFacts, misfit: Misfit, retest: Retest, *, alpha: float, tau_px: float
-) -> str | None:
+def image_advice(fact: CameraFacts, misfit: Misfit, retest: Retest, *, alpha: float, tau_px: float) -> str | None:
     """Return the camera model that one image asks for; ``retest`` of its points and residuals."""
     return advised_camera_model(
         fact.shape.camera,

@@ -11,7 +11,7 @@ from audit.cameras.columns import EPSILON, Want
 from audit.cameras.projection import check_shapes, extra_params, is_fisheye, scale_and_shift
 from audit.cameras.rational import RATIONAL_DEPTHS
 from audit.cameras.spherical import spherical_rays
-from audit.cameras.warps import WARPS, WarpFunction
+from audit.cameras.warps import WARPS, WarpFunction, radial, radial_gain
 from loaders.arrays import BoolArray, FloatArray
 from loaders.camera_models import CameraModel
 
@@ -78,6 +78,8 @@ def undistort(
     """Return the (n,) undistorted u, v with warp(u, v) = (x, y); NaN where there is none or it was not found."""
     if not extra:
         return x.copy(), y.copy()
+    if warp is radial:
+        return _undistort_radially(extra, x, y)
     u, v = np.zeros_like(x), np.zeros_like(y)
     for _ in range(MAX_ITERATIONS):
         at = warp(u, v, extra, Want.D_POINT)
@@ -94,6 +96,28 @@ def undistort(
     found = np.hypot(at.x - x, at.y - y) <= TOLERANCE * (1.0 + np.hypot(x, y))
     found &= ~_folded_on_the_way(warp, extra, u, v)
     return np.where(found, u, np.nan), np.where(found, v, np.nan)
+
+
+def _undistort_radially(extra: Sequence[float], x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Do what `undistort` does for the warp ``radial``, whose steps all point along the radius."""
+    goal = np.hypot(x, y)
+    radius = np.zeros_like(goal)
+    for _ in range(MAX_ITERATIONS):
+        r2 = radius * radius
+        gain, slope = radial_gain(r2, extra)
+        step = (radius * gain - goal) / (gain + (2.0 * slope) * r2)
+        size, length = np.abs(radius), np.abs(step)
+        reach = STEP * np.maximum(size, 1.0)
+        radius = radius - step * (reach / np.maximum(reach, length))
+        if not (length > CONVERGED * (1.0 + size)).any():
+            break
+    gain, _ = radial_gain(radius * radius, extra)
+    found = np.abs(radius * gain - goal) <= TOLERANCE * (1.0 + goal)
+    r2_on_the_way = np.multiply.outer(FRACTIONS**2, radius * radius)
+    gain_on_the_way, slope = radial_gain(r2_on_the_way, extra)
+    determinant = gain_on_the_way * (gain_on_the_way + (2.0 * slope) * r2_on_the_way)
+    found &= determinant.min(axis=0) > 0.0
+    return np.where(found, x / gain, np.nan), np.where(found, y / gain, np.nan)
 
 
 def _folded_on_the_way(warp: WarpFunction, extra: Sequence[float], u: FloatArray, v: FloatArray) -> BoolArray:

@@ -66,11 +66,17 @@ def _radially(u: FloatArray, v: FloatArray, gain: FloatArray, slope: Column, d_e
 def radial(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want) -> Warp:
     """Scale by 1 + k1 r^2 + k2 r^4 + ..: SIMPLE_RADIAL, RADIAL, OPENCV_FISHEYE and the radial fisheye models."""
     r2 = u * u + v * v
-    gain, slope = _polynomial(r2, extra)
-    gain += 1.0
+    gain, slope = radial_gain(r2, extra)
     if want is Want.VALUE:
         return Warp(u * gain, v * gain)
     return _radially(u, v, gain, slope, _radial_extra(u, v, r2, len(extra)) if want is Want.D_EXTRA else ())
+
+
+def radial_gain(r2: FloatArray, extra: Sequence[float]) -> tuple[FloatArray, Column]:
+    """Return g = 1 + k1 r^2 + k2 r^4 + .. and dg / d r^2, by which ``radial`` scales."""
+    gain, slope = _polynomial(r2, extra)
+    gain += 1.0
+    return gain, slope
 
 
 def _tangential_extra(u: FloatArray, v: FloatArray, r2: FloatArray) -> tuple[Pair, Pair]:

@@ -83,7 +83,8 @@ def judged_by_f(
     """
     if not ranks:
         return []
-    n, rank, starts = num_clusters, np.array(ranks), np.cumsum(ranks) - ranks
+    n, rank = num_clusters, np.array(ranks, dtype=np.int64)
+    starts: IntArray = np.cumsum(rank) - rank
     statistics = _quadratic_forms(scores, meat, rank)
     left = np.maximum(1.0 - statistics / n, 0.0)  # T >= n: p = 0
     p = special.betainc(0.5 * (n - rank), 0.5 * rank, left)

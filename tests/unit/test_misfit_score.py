@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from misfit_reference import PARAMS, camera, columns_of, interleaved, planar_points, points, slow_tests
 from numpy.testing import assert_allclose
+from scipy import stats
 
 from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, prepare, prepare_image, project_image
+from audit.misfit.basis import field_transform, largest_sq
 from audit.misfit.outcome import judged_by_f
 from loaders.camera_models import CAMERA_MODELS
 
@@ -209,6 +211,58 @@ def test_p_keeps_its_digits_in_the_tail():
             if exact > math.log(1e-300):
                 assert_allclose(math.log(test.p), exact, rtol=1e-11, atol=1e-13)
     assert judged_by_f(np.array([math.sqrt(250.0), 0.0]), np.eye(2), [2], 250, 250)[0].p == 0.0
+
+
+@pytest.mark.parametrize("unit", [1e-140, 1e-40, 1e-20, 1e20, 1e40, 1e140])
+def test_the_units_of_fields_do_not_matter(unit):
+    """Whether lengths enter with the transforms or, far from 1, with the fields."""
+    rng = np.random.default_rng(15)
+    nuisance, fields = columns_of(camera(), points(rng, 200))
+    y = rng.standard_normal((2, 200))
+    clusters = np.arange(200) // 2
+    plain = prepare(nuisance, fields, clusters=clusters)
+    mixed = prepare(nuisance, fields * np.where(np.arange(42) % 3, 1.0, unit)[:, None, None], clusters=clusters)
+    for group in GROUPS:
+        one, other = plain.test(y)[group], mixed.test(y)[group]
+        assert (one.rank, one.status) == (other.rank, other.status)
+        assert_allclose([other.p, other.px], [one.p, one.px], rtol=1e-8, atol=1e-12)
+        assert_allclose(mixed.explained_px(y, group), plain.explained_px(y, group), rtol=1e-7, atol=1e-10)
+
+
+def test_groups_judged_together_are_judged_as_alone():
+    """What stands between two groups in the meat does not matter, nor does a singular neighbour."""
+    rng = np.random.default_rng(14)
+    ranks, n = [2, 1, 6], 400
+    g = rng.standard_normal((sum(ranks), n))
+    scores, meat = g.sum(axis=1), g @ g.T
+    blocks = [slice(0, 2), slice(2, 3), slice(3, 9)]
+    for singular in (False, True):
+        if singular:
+            meat[2, 2] = 0.0
+        together = judged_by_f(scores, meat, ranks, n, n)
+        for rank, own, test in zip(ranks, blocks, together, strict=True):
+            (alone,) = judged_by_f(scores[own], meat[own, own], [rank], n, n)
+            assert_allclose([test.p, test.px], [alone.p, alone.px], rtol=1e-12)
+            assert (test.status, test.rank) == (alone.status, rank)
+            if test.status is MisfitStatus.TESTED:
+                statistic = scores[own] @ np.linalg.solve(meat[own, own], scores[own])
+                f = statistic / rank * (n - rank) / n / (1.0 - statistic / n)
+                assert_allclose(test.p, stats.f.sf(f, rank, n - rank), rtol=1e-9)
+        assert [test.status is MisfitStatus.SINGULAR for test in together] == [False, singular, False]
+    assert judged_by_f(np.empty(0), np.empty((0, 0)), [], n, n) == []
+
+
+@pytest.mark.parametrize("value", [1e-3, 3.5e-10, 2.5e-10, 1e-12, 3.5e-14, 2.5e-14, 2e-15])
+def test_a_rank_is_decided_by_the_largest_singular_value_before_projection(value):
+    """Its bounds decide most cases; between them the eigenvalue itself does, and says so where it cannot."""
+    before = np.diag([3.0, 0.5, 0.5])  # trace 4, largest 3
+    transform = field_transform(np.diag([2.0, 1.0, value]), before)
+    if 3e-14 < value < 3e-10:
+        assert transform is None
+    else:
+        assert transform is not None
+        assert transform.shape == (3, 3 if value > 3e-10 else 2)
+    assert largest_sq(before) == 3.0
 
 
 def test_explained_field_has_the_length_of_the_scores():
