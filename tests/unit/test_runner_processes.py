@@ -18,7 +18,7 @@ from audit.config import AuditConfig
 from audit.engine import ModelAuditor, audit_model
 from audit.schedule.images import image_processes, read_shared, write_shared
 from audit.schedule.lanes import Died, Lanes, RemoteTracebackError
-from audit.schedule.processes import BYTES_WORTH_A_PROCESS, in_processes, planned
+from audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
 from audit.schedule.task import Audited, Failure, Task, audit_one
 from audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
 from loaders import discover, open_model
@@ -40,7 +40,7 @@ def tasks_of(sizes):
         ((GB,) * 5, 4, [1, 1, 1, 1, 1]),
         ((GB, 8 * GB, GB), 5, [4, 1, 1]),  # the largest first
         ((1000,), 4, [1]),  # not worth a process
-        ((2 * BYTES_WORTH_A_PROCESS,), 16, [2]),
+        ((2 * BYTES_WORTH_A_SHARE,), 16, [2]),
         ((0, 0), 2, [1, 1]),
     ],
 )
