@@ -14,5 +14,6 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        advice = f'it belongs to the extra "{name}": pip install "sfm-audit[{name}]"'
+        command = f'pip install "sfm-audit[{name}]" (in a checkout: .venv/bin/pip install -e ".[{name}]")'
+        advice = f'it belongs to the extra "{name}": {command}'
         raise KnownError(f"{error.name} is not installed; {advice}", ExitCode.USAGE) from error
