@@ -22,17 +22,15 @@ from audit.misfit_verdict import shared_camera_reason
 from audit.multiplicity import benjamini_hochberg
 from audit.noise import fit_constant_variance
 from audit.observations import observation_table
+from audit.residual_findings import residual_findings
 from audit.residuals import ModelResiduals, model_residuals
 from audit.rows import Row, camera_row, image_row, model_row
 from audit.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
-from audit.stored_errors import StoredErrors, compare_stored_errors, stale_finding
+from audit.stored_errors import StoredErrors, compare_stored_errors
 from audit.table import ModelLabels, TableName, build_table, empty_table, schema
 from audit.verdict import Judgement, Reason, ReasonCode
 from loaders.arrays import FloatArray, IntArray
-from loaders.model import CameraRecord, Finding, FindingCode, InlierSet, SparseModel
-
-_REMOVABLE_SHARE = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
-
+from loaders.model import CameraRecord, InlierSet, SparseModel
 
 T = TypeVar("T")
 
@@ -294,7 +292,8 @@ class ModelAuditor:
             any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in members.ks.reasons)
             for _, members in judgements
         )
-        findings = [*self.model.findings, *self._own_findings(num_exact)]
+        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
+        findings = [*self.model.findings, *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, judgements)
         return ModelAudit(
             _images_table(rows),
@@ -302,25 +301,6 @@ class ModelAuditor:
             _table("models", [row]),
             self.observations(labels) if observations else None,
         )
-
-    def _own_findings(self, num_exact: int) -> list[Finding]:
-        """Findings that need residuals."""
-        statistics = self.tracks.statistics
-        found = [stale_finding(self.stored_errors)]
-        if num_exact:
-            text = f"the 2D points of {num_exact} images are projections of the 3D points, not measurements"
-            found.append(Finding(FindingCode.EXACT_PROJECTIONS, num_exact, text))
-        elif statistics.removable_sq_px2 > _REMOVABLE_SHARE * statistics.total_sq_px2:
-            share = statistics.removable_sq_px2 / statistics.total_sq_px2
-            text = f"3D points are not at their optimum: moving them alone removes {share:.1%} of the squared residuals"
-            found.append(Finding(FindingCode.POINTS_NOT_OPTIMAL, len(self.model.points), text))
-        if self.tracks.too_many_nonstationary:
-            count = int(np.count_nonzero(self.tracks.nonstationary))
-            text = (
-                f"{count} images are not at the optimum of their poses, too many to leave out of the track statistics"
-            )
-            found.append(Finding(FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES, count, text))
-        return [finding for finding in found if finding is not None]
 
 
 def audit_model(
