@@ -10,10 +10,10 @@ import importlib.metadata
 import logging
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import dask
-from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, as_completed
 from threadpoolctl import threadpool_limits
 
 from audit.schedule.errors import ClusterError
@@ -79,19 +79,25 @@ def _run(
             future, result = next(ended)
             task = task_of.pop(future.key)
             ask()
-            yield task, _outcome(future, result)
+            yield task, _outcome(result, is_connected=client.status == "running")
     except (OSError, TimeoutError) as error:
         raise ClusterError(_LOST) from error
 
 
-def _outcome(future: Future[Any], result: Any) -> Outcome | None:
-    if future.status == "finished":
-        return cast("Outcome", result)
-    if future.status == "error":
+def _outcome(result: Any, *, is_connected: bool) -> Outcome | None:
+    """Return what a future gave; None where its worker was lost.
+
+    Not by its status: when a worker is lost, a future whose result is already here is "lost" as well.
+    """
+    if isinstance(result, Outcome):
+        return result
+    if isinstance(result, tuple):
         _, error, trace = result
         if isinstance(error, KilledWorker):
             return None
         raise error.with_traceback(trace)
+    if is_connected:  # cancelled, but not by the loss of the scheduler
+        return None
     raise ClusterError(_LOST)
 
 
@@ -107,6 +113,8 @@ def _audit_there(audit: AuditFunction, task: Task, version: str) -> Outcome:
 
 @contextmanager
 def _client(address: str, jobs: int) -> Iterator[Client]:
+    for name in ("distributed", "distributed.client"):  # a lost cluster is one line, and it is ours
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if address == LOCAL:
         settings = {
             "distributed.scheduler.allowed-failures": 0,  # a model that kills its worker is tried once more by us

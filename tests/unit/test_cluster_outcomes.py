@@ -1,0 +1,34 @@
+"""What a Dask future that ended says of its model."""
+
+from asyncio import CancelledError
+
+import pytest
+
+pytest.importorskip("distributed")
+
+from distributed import KilledWorker
+
+from audit.schedule.cluster import _outcome
+from audit.schedule.errors import ClusterError
+from audit.schedule.task import Failure, Unchanged
+
+
+@pytest.mark.parametrize("is_connected", [True, False])
+@pytest.mark.parametrize("outcome", [Unchanged(), Failure("a/0", "cut short")])
+def test_a_result_that_is_here_counts_whatever_became_of_its_worker(outcome, is_connected):
+    assert _outcome(outcome, is_connected=is_connected) is outcome
+
+
+def test_a_model_that_killed_its_workers_is_tried_again():
+    assert _outcome((KilledWorker, KilledWorker.__new__(KilledWorker), None), is_connected=True) is None
+
+
+def test_a_cancelled_model_is_tried_again_while_there_is_a_cluster():
+    assert _outcome(CancelledError("key"), is_connected=True) is None
+    with pytest.raises(ClusterError, match="the cluster was lost"):
+        _outcome(CancelledError("key"), is_connected=False)
+
+
+def test_an_error_of_ours_keeps_its_kind():
+    with pytest.raises(ZeroDivisionError):
+        _outcome((ZeroDivisionError, ZeroDivisionError("x"), None), is_connected=True)
