@@ -14,6 +14,7 @@ from audit.camera_facts import CameraFacts
 from audit.image_audit import ImageAudit, Judgements
 from audit.misfit import GROUPS, MisfitTests
 from audit.misfit_verdict import Misfit
+from audit.normality import NormalityTests
 from audit.standardise import ModelTracks
 from audit.stored_errors import StoredErrors
 from audit.table import ModelLabels
@@ -104,12 +105,11 @@ def _noise_columns(audit: ImageAudit) -> Row:
     }
 
 
-def _test_columns(audit: ImageAudit) -> Row:
-    tests, constant = audit.tests, audit.constant_tests
+def normality_columns(tests: NormalityTests) -> Row:
+    """The tests of the chosen noise model's z, as images and calibrations have them."""
     return {
         "ks_stat": tests.ks_stat,
         "ks_p": tests.ks_p,
-        "ks_q": math.nan,
         "ks_fitted_p": tests.ks_fitted_p,
         "ks_norm_p": tests.ks_norm_p,
         "ks_norm_unscaled_p": tests.ks_norm_unscaled_p,
@@ -119,6 +119,14 @@ def _test_columns(audit: ImageAudit) -> Row:
         "sw_p": tests.sw_p,
         "skewness": tests.skewness,
         "kurtosis_excess": tests.kurtosis_excess,
+    }
+
+
+def _test_columns(audit: ImageAudit) -> Row:
+    constant = audit.constant_tests
+    return {
+        **normality_columns(audit.tests),
+        "ks_q": math.nan,
         "ks_constant_stat": constant.ks_stat,
         "ks_constant_p": constant.ks_p,
         "ks_fitted_constant_p": constant.ks_fitted_p,

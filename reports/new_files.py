@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from reports.errors import OutputError
+from reports.disk import write_whole, writing
 
 
 class OutputExistsError(Exception):
@@ -39,7 +39,7 @@ def check_free(path: Path, *, force: bool, replaceable: frozenset[str] = frozens
         return
     if not path.is_dir():
         raise OutputExistsError(f"{path}: is a file; name a folder")
-    with _writing(path):
+    with writing(path):
         names = sorted(child.name for child in path.iterdir())
     foreign = [name for name in names if name not in replaceable]
     if foreign:
@@ -50,18 +50,9 @@ def check_free(path: Path, *, force: bool, replaceable: frozenset[str] = frozens
 
 def write_file(path: Path, content: bytes) -> None:
     """Write a file that is there completely or not at all; OutputError where the operating system refuses."""
-    temporary = path.with_name(f".tmp-sfm-audit-{os.getpid()}-file")
-    with _writing(path):
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    write_whole(path, [content])
 
 
 @contextmanager
@@ -76,12 +67,12 @@ def new_folder(path: Path) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".tmp-sfm-audit-{os.getpid()}")
     old = target.with_name(f".old-sfm-audit-{os.getpid()}")
-    with _writing(path):
+    with writing(path):
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
     try:
         yield temporary
-        with _writing(path):
+        with writing(path):
             if target.exists():
                 target.rename(old)
             try:
@@ -94,11 +85,3 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         if target.exists():
             shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error

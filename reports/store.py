@@ -8,9 +8,7 @@ commands may write into an existing folder.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +21,7 @@ from filelock import FileLock, Timeout
 from loaders.discover import ModelRef
 from loaders.input_state import InputState
 from loaders.locations import real_location
+from reports.disk import flush_folder, write_whole, writing
 from reports.errors import OutputError, RunFolderError
 
 TOOL: Final = "sfm-audit"
@@ -114,7 +113,7 @@ class RunStore:
             It cannot be made or written.
         """
         _refuse_foreign_folder(self.folder)
-        with _writing(self.folder):
+        with writing(self.folder):
             for name in self._wanted:
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
         self._acquire()
@@ -161,7 +160,7 @@ class RunStore:
         for name in self._wanted:
             buffer = pa.BufferOutputStream()
             pq.write_table(tables[name].replace_schema_metadata(metadata), buffer)
-            _write_atomically(self._path(name, ref.key), [buffer.getvalue()])
+            write_whole(self._path(name, ref.key), [buffer.getvalue()])
         self._entries[ref.key] = _Entry.of(part, ref)
 
     def drop(self, key: str) -> None:
@@ -169,10 +168,10 @@ class RunStore:
         self._entries.pop(key, None)
         for name in reversed(_ALL_TABLES):
             path = self._path(name, key)
-            with _writing(path):
+            with writing(path):
                 if path.exists():
                     path.unlink()
-                    _flush_folder(path.parent)  # no later part may reach the disk before the mark is gone from it
+                    flush_folder(path.parent)  # no later part may reach the disk before the mark is gone from it
 
     def finish(self, keep: Iterable[str] | None, failures: Sequence[tuple[str, str]], seconds: float) -> None:
         """Complete run.json, after removing all models but those in ``keep`` (None: remove nothing).
@@ -235,7 +234,7 @@ class RunStore:
         ]
 
     def _remove_temporary_files(self) -> None:
-        with _writing(self.folder):
+        with writing(self.folder):
             for folder in (self.folder, *(self.folder / name for name in _ALL_TABLES)):
                 for path in folder.glob(".tmp-*"):
                     path.unlink()
@@ -245,7 +244,7 @@ class RunStore:
         head = {"tool": TOOL, "version": settings.version, "status": status}
         bound = {"config": self._config(), "paths": self._paths}
         text = json.dumps({**head, **bound, **content}, indent=1)
-        _write_atomically(self.folder / "run.json", _with_inputs(text.encode(), inputs))
+        write_whole(self.folder / "run.json", _with_inputs(text.encode(), inputs))
 
 
 def _labels(ref: ModelRef) -> dict[str, str]:
@@ -255,7 +254,7 @@ def _labels(ref: ModelRef) -> dict[str, str]:
 def _refuse_foreign_folder(folder: Path) -> None:
     if not folder.is_dir() or (folder / "run.json").exists():
         return
-    with _writing(folder):
+    with writing(folder):
         names = sorted(path.name for path in folder.iterdir())
     foreign = [name for name in names if name not in _OWN_FILES and not name.startswith(".tmp-")]
     if foreign:
@@ -297,38 +296,3 @@ def _with_inputs(text: bytes, inputs: Iterable[bytes] | None) -> Iterator[bytes]
         yield separator + line
         separator = b",\n  "
     yield b"\n ]\n}"
-
-
-def _write_atomically(path: Path, content: Iterable[bytes | pa.Buffer]) -> None:
-    temporary = path.with_name(f".tmp-{path.name}")
-    with _writing(path):
-        try:
-            with temporary.open("wb") as file:
-                for piece in content:
-                    file.write(piece)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-        _flush_folder(path.parent)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Make a rename survive a power cut; Windows has no such call for folders."""
-    if os.name == "nt":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error

@@ -14,7 +14,7 @@ from audit.calibrate.estimate import DegenerateInputError, Estimate
 from audit.calibrate.evidence import correlation_focal_depth
 from audit.calibrate.validation import Validation, degenerate_judgement
 from audit.normality import NormalityTests
-from audit.rows import cause_columns, misfit_columns
+from audit.rows import cause_columns, misfit_columns, normality_columns
 from audit.table import schema
 from audit.verdict import Verdict
 from loaders.arrays import FloatArray
@@ -143,17 +143,7 @@ def _error_columns(found: Validation) -> Row:
 def _test_columns(found: Validation, alpha: float) -> Row:
     tests, plain = found.robust.tests, found.plain.tests
     return {
-        "ks_stat": tests.ks_stat,
-        "ks_p": tests.ks_p,
-        "ks_fitted_p": tests.ks_fitted_p,
-        "ks_norm_p": tests.ks_norm_p,
-        "ks_norm_unscaled_p": tests.ks_norm_unscaled_p,
-        "dap_stat": tests.dap_stat,
-        "dap_p": tests.dap_p,
-        "sw_stat": tests.sw_stat,
-        "sw_p": tests.sw_p,
-        "skewness": tests.skewness,
-        "kurtosis_excess": tests.kurtosis_excess,
+        **normality_columns(tests),
         "tests_rejecting": tests_rejecting(tests, alpha),
         "sd_plain_px": found.plain.sd_px,
         "ks_plain_stat": plain.ks_stat,

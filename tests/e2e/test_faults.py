@@ -15,6 +15,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from audit_stubs import SECONDS
+from process_tree import descendants, is_worker
 from run_samples import copy_models, part_times, read_run, run_cli, start_cli, truncate, wait_for
 
 from audit.cli.main import main
@@ -60,21 +61,6 @@ def check(run: Path, expected) -> None:
     for name in expected:
         assert len(list((run / name).iterdir())) == NUM_SCENES
     assert not list(run.rglob(".tmp-*"))
-
-
-def descendants(pid: int) -> list[int]:
-    try:
-        children = [c for t in Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text("ascii").split()]
-    except OSError:
-        return []
-    return [found for child in map(int, children) for found in (child, *descendants(child))]
-
-
-def is_worker(pid: int) -> bool:
-    try:
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return False
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from run_samples import STATE, make_ref, part_times, sample_tables, settings
 
 from audit.config import AuditConfig
 from loaders.input_state import InputState
+from reports import disk
 from reports import store as store_module
 from reports.errors import OutputError, RunFolderError
 from reports.reader import RunReader
@@ -111,7 +112,7 @@ def test_another_version_or_other_labels_make_a_model_unfinished(tmp_path):
 
 def test_a_rewritten_model_is_unfinished_until_its_last_part(tmp_path, monkeypatch):
     write_run(tmp_path, [A])
-    write = store_module._write_atomically
+    write = store_module.write_whole
 
     def fail_on_models(path: Path, content: bytes) -> None:
         if path.parent.name == "models":
@@ -119,7 +120,7 @@ def test_a_rewritten_model_is_unfinished_until_its_last_part(tmp_path, monkeypat
         write(path, content)
 
     with RunStore(tmp_path, settings()) as store:
-        monkeypatch.setattr(store_module, "_write_atomically", fail_on_models)
+        monkeypatch.setattr(store_module, "write_whole", fail_on_models)
         with pytest.raises(OutputError):
             store.write(A, InputState(1, "new", "new"), sample_tables(A, ("rejected",)), 0.1)
         assert store.finished(A) is None
@@ -127,7 +128,7 @@ def test_a_rewritten_model_is_unfinished_until_its_last_part(tmp_path, monkeypat
 
 def test_the_models_part_which_says_finished_is_written_last(tmp_path, monkeypatch):
     written = []
-    monkeypatch.setattr(store_module, "_write_atomically", lambda path, _: written.append(path.parent.name))
+    monkeypatch.setattr(store_module, "write_whole", lambda path, _: written.append(path.parent.name))
     with RunStore(tmp_path, settings()) as store:
         written.clear()
         store.write(A, STATE, sample_tables(A), 0.1)
@@ -142,7 +143,7 @@ def test_a_full_disk_is_one_line_and_leaves_finished_parts_and_no_other_files(tm
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with RunStore(tmp_path, settings()) as store:
-        monkeypatch.setattr(store_module.os, "fsync", no_space)
+        monkeypatch.setattr(os, "fsync", no_space)
         with pytest.raises(OutputError, match="No space left on device") as caught:
             store.write(B, STATE, sample_tables(B), 0.1)
     assert "\n" not in str(caught.value)
@@ -274,7 +275,8 @@ def test_the_mark_of_a_model_is_gone_from_the_disk_before_its_parts_are_written_
     write_run(tmp_path, [A])
     flushed = []
     with RunStore(tmp_path, settings()) as store:
-        monkeypatch.setattr(store_module, "_flush_folder", lambda folder: flushed.append(folder.name))
+        for module in (store_module, disk):  # the mark's folder, and that of every file written
+            monkeypatch.setattr(module, "flush_folder", lambda folder: flushed.append(folder.name))
         store.write(A, InputState(1, "new", "new"), sample_tables(A), 0.1)
     assert flushed[0] == "models"
     assert flushed[-1] == "models"
