@@ -6,7 +6,9 @@ from numpy.testing import assert_allclose
 
 from audit import AuditConfig, ModelAuditor, audit_model
 from audit.blame import Peeling
+from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, MisfitTest
 from audit.misfit.basis import nuisance_basis, nuisance_transform, unit_columns
+from audit.misfit.outcome import not_tested
 from audit.simulate.adjust import adjust_scene, sparse_model
 from audit.simulate.defects import DefectKind, DefectSpec
 from audit.simulate.noise import NoiseKind, NoiseSpec
@@ -60,6 +62,30 @@ def test_testing_suspects_ends_where_testing_all_images_in_every_round_ends(monk
         assert_allclose(one.final.q, other.final.q, rtol=1e-12)
         assert_allclose(one.final.px, other.final.px, rtol=1e-12)
         assert (one.residuals_px == other.residuals_px).all()
+
+
+class Masked(Peeling):
+    """Image 7 looks sound until image 3 is out; all others always do. Every point moves."""
+
+    def _without(self, flagged):
+        self.out = set(np.flatnonzero(flagged).tolist())
+        everything = np.ones(self._residuals.point_idx.size, dtype=bool)
+        return self._residuals.residuals_px, np.ones(len(self._model.points), dtype=bool), everything
+
+    def _test(self, image_idx, _residuals_px, _clean):
+        return radial(0.5) if image_idx == 3 or (image_idx == 7 and 3 in self.out) else radial(0.0)
+
+
+def radial(px):
+    untested = dict.fromkeys(GROUPS, not_tested(MisfitStatus.ABSORBED, 0))
+    return untested | {MisfitGroup.RADIAL: MisfitTest(1e-12 if px else 0.5, px, 2, MisfitStatus.TESTED)}
+
+
+def test_an_image_that_was_never_suspected_is_taken_out_when_it_shows_at_last():
+    auditor = ModelAuditor(model_of()[0])
+    peeling = Masked(auditor.model, auditor.residuals, np.zeros(20, dtype=bool), alpha=0.05, tau_px=auditor.tau_px)
+    blame = peeling.run([radial(0.5 if i == 3 else 0.0) for i in range(20)])
+    assert set(np.flatnonzero(blame.flagged)) == {3, 7}
 
 
 def test_what_peeling_leaves_unflagged_is_tested_against_the_final_points(quarter):
