@@ -9,11 +9,11 @@ import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from audit.config import AuditConfig
-    from audit.engine import ModelAudit, ModelAuditor, audit_model
-    from audit.image_audit import ImageAudit, audit_inliers
-    from audit.table import ModelLabels
-    from audit.verdict import Judgement, Reason, ReasonCode, Verdict
+    from sfm_audit.audit.config import AuditConfig
+    from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict
+    from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
+    from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor, audit_model
+    from sfm_audit.audit.table import ModelLabels
 
 __all__ = [
     "AuditConfig",
@@ -30,11 +30,11 @@ __all__ = [
 ]
 
 _HOMES: Final = {
-    "audit.config": ("AuditConfig",),
-    "audit.engine": ("ModelAudit", "ModelAuditor", "audit_model"),
-    "audit.image_audit": ("ImageAudit", "audit_inliers"),
-    "audit.table": ("ModelLabels",),
-    "audit.verdict": ("Judgement", "Reason", "ReasonCode", "Verdict"),
+    "sfm_audit.audit.config": ("AuditConfig",),
+    "sfm_audit.audit.engine.model": ("ModelAudit", "ModelAuditor", "audit_model"),
+    "sfm_audit.audit.engine.image": ("ImageAudit", "audit_inliers"),
+    "sfm_audit.audit.table": ("ModelLabels",),
+    "sfm_audit.audit.decision.verdict": ("Judgement", "Reason", "ReasonCode", "Verdict"),
 }
 
 

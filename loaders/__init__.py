@@ -1,8 +1,9 @@
 """Reconstructions in, one columnar model out."""
 
-from loaders.colmap import open_model
-from loaders.discover import Discovery, ModelRef, discover
-from loaders.errors import (
+from sfm_audit.loaders.colmap.folder import open_model
+from sfm_audit.loaders.datasets.discover import Discovery, ModelRef, discover
+from sfm_audit.loaders.datasets.fingerprint import InputFile, input_files
+from sfm_audit.loaders.errors import (
     LfsPointerError,
     LoadError,
     MalformedFileError,
@@ -11,8 +12,7 @@ from loaders.errors import (
     TruncatedFileError,
     UnreadableFileError,
 )
-from loaders.fingerprint import InputFile, input_files
-from loaders.model import (
+from sfm_audit.loaders.model import (
     CameraRecord,
     CameraTable,
     Finding,

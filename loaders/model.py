@@ -12,8 +12,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
-from loaders.camera_models import BY_ID, CameraModel
+from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.camera_models import BY_ID, CameraModel
 
 
 class FindingCode(StrEnum):

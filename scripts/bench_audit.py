@@ -40,25 +40,23 @@ def load_pycolmap(folder: str) -> None:
 def import_audit(folder: str) -> None:
     """Nothing but imports."""
     del folder
-    import audit.engine  # noqa: PLC0415
-    import loaders  # noqa: PLC0415
-
-    del audit, loaders
+    import sfm_audit.audit.engine.model  # noqa: PLC0415
+    import sfm_audit.loaders  # noqa: PLC0415, F401
 
 
 def load(folder: str) -> None:
     """Files to columns."""
-    from loaders import open_model  # noqa: PLC0415
+    from sfm_audit.loaders import open_model  # noqa: PLC0415
 
     open_model(folder)
 
 
 def goodness_of_fit(folder: str) -> None:
     """Load, then residuals, noise models constant and track, and the tests of normality of every image."""
-    from audit.engine import ModelAuditor  # noqa: PLC0415
-    from audit.normality import normality_tests  # noqa: PLC0415
-    from audit.standardise import constant_noise, track_noise  # noqa: PLC0415
-    from loaders import open_model  # noqa: PLC0415
+    from sfm_audit.audit.engine.model import ModelAuditor  # noqa: PLC0415
+    from sfm_audit.audit.noise.standardise import constant_noise, track_noise  # noqa: PLC0415
+    from sfm_audit.audit.normality import normality_tests  # noqa: PLC0415
+    from sfm_audit.loaders import open_model  # noqa: PLC0415
 
     auditor = ModelAuditor(open_model(folder))
     for image_idx in range(len(auditor.model.images)):
@@ -69,8 +67,8 @@ def goodness_of_fit(folder: str) -> None:
 
 def everything(folder: str) -> None:
     """Load, then all tables: misfit, peeling, cameras, plausibility, verdicts."""
-    from audit.engine import audit_model  # noqa: PLC0415
-    from loaders import open_model  # noqa: PLC0415
+    from sfm_audit.audit.engine.model import audit_model  # noqa: PLC0415
+    from sfm_audit.loaders import open_model  # noqa: PLC0415
 
     audit_model(open_model(folder))
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
+from sfm_audit.audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
 
 MEGADEPTH = ("MegaDepth", 100_000, 196)  # registered images, models
 MEGASCENES = ("MegaScenes", 2_000_000, 100_000)
@@ -57,7 +57,7 @@ HEADER = "models   images observations   wall s    CPU s images/s        obs/s C
 
 def measure(paths: Sequence[Path], run: Path, options: Sequence[str]) -> Measured:
     """Audit models in a process of its own; its workers are its children."""
-    code = "from audit.cli.main import entry_point; entry_point()"
+    code = "from sfm_audit.audit.cli.main import entry_point; entry_point()"
     command = [sys.executable, "-c", code, "run", *map(str, paths), "-o", str(run), "--quiet", *options]
     start, cpu_before = time.perf_counter(), os.times()
     peaks: dict[int, float] = {}

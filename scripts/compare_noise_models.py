@@ -22,18 +22,18 @@ from typing import Final
 
 import numpy as np
 
-from audit.config import AuditConfig
-from audit.keypoint_noise import KeypointTracks, keypoint_noise, keypoint_tracks, scale_only_noise
-from audit.noise import fit_constant_variance, fit_variance
-from audit.normality import normality_tests
-from audit.predictive import TrackStandardiser, fit_track_prior, predict
-from audit.residuals import ModelResiduals, model_residuals
-from audit.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
-from audit.tracks import TrackStatistics, track_statistics
-from loaders import open_model
-from loaders.arrays import BoolArray, FloatArray
-from loaders.colmap_database import find_database, read_keypoint_shapes
-from loaders.discover import discover
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
+from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
+from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks, scale_only_noise
+from sfm_audit.audit.noise.predictive import TrackStandardiser, fit_track_prior, predict
+from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
+from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
+from sfm_audit.audit.normality import normality_tests
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders.datasets.discover import discover
 
 NAMES: Final = ("constant", "scale alone", "track", "track and scale")
 CONFIG: Final = AuditConfig()

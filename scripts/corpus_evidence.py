@@ -16,8 +16,8 @@ import pandas as pd
 import pycolmap
 from scipy.spatial import cKDTree
 
-from audit import ModelAuditor, audit_model
-from audit.misfit import (
+from sfm_audit.audit import ModelAuditor, audit_model
+from sfm_audit.audit.misfit import (
     GROUPS,
     MisfitGroup,
     camera_tests,
@@ -27,15 +27,15 @@ from audit.misfit import (
     prepare,
     project_image,
 )
-from audit.misfit.capabilities import extended_params
-from audit.misfit.fields import GROUP_COLUMNS
-from audit.misfit.pooled import ImageDesign
-from audit.noise import fit_constant_variance
-from audit.normality import normality_tests
-from audit.simulate.colmap_files import write_colmap_binary
-from loaders import ModelRef, SparseModel, open_model
-from loaders.arrays import FloatArray, IntArray
-from loaders.camera_models import BY_NAME
+from sfm_audit.audit.misfit.capabilities import extended_params
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.audit.misfit.pooled import ImageDesign
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.normality import normality_tests
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.loaders import ModelRef, SparseModel, open_model
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.camera_models import BY_NAME
 
 SIGNIFICANT: Final = 0.01
 MIN_INLIERS: Final = 50

@@ -23,10 +23,10 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from audit.misfit import GROUPS
-from loaders import LoadError, ModelRef, discover
 from scripts.corpus_evidence import AuditedModel, audit_for_report
 from scripts.corpus_explanations import EXPLANATIONS
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.loaders import LoadError, ModelRef, discover
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 MIN_INLIERS: Final = 50  # in the median image, for the table of noise models

@@ -6,15 +6,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from audit.config import AuditConfig
-from audit.table import TABLES
-from audit.verdict import REASON_MEANINGS, ReasonCode
-from loaders.model import FINDING_MEANINGS, FindingCode
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.verdict import REASON_MEANINGS, ReasonCode
+from sfm_audit.audit.table import TABLES
+from sfm_audit.loaders.model import FINDING_MEANINGS, FindingCode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TABLES_INTRODUCTION = """# Tables
 
-Made from `audit/table.py` by `scripts/make_docs_tables.py`; do not edit.
+Made from `audit/table/columns.py` by `scripts/make_docs_tables.py`; do not edit.
 
 A run folder holds one Parquet file per model in each of `RUN/images`, `RUN/cameras` and `RUN/models`, and with
 `--observations` in `RUN/observations`. `pandas.read_parquet(RUN + "/images")` reads all of them. A value that was not
@@ -64,7 +64,7 @@ code 3.
 """
 VERDICTS_PAGE = """# Verdicts
 
-Made from `audit/verdict.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
+Made from `audit/decision/verdict.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
 
 Four verdicts judge an image, each by its own question. Each is `accepted`, `rejected`, or `undetermined` where the
 image does not say enough: undetermined is no pass.

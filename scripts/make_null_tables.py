@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from audit.normality.null_tables import NullTable, modified_exponential, modified_normal, null_p
+from sfm_audit.audit.normality.null_tables import NullTable, modified_exponential, modified_normal, null_p
 
 FloatArray = npt.NDArray[np.float64]
 Draw = Callable[[np.random.Generator, int, int], FloatArray]

@@ -13,7 +13,7 @@ import os
 import time
 from pathlib import Path
 
-from audit.simulate.dataset import DatasetSpec, write_dataset
+from sfm_audit.audit.simulate.dataset import DatasetSpec, write_dataset
 
 
 def main() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from audit.simulate.adjust import true_claim, write_model
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.adjust import true_claim, write_model
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 _TRACK_DECAY = 0.70  # mean track length 5, as 2 M observations of 400,000 points
 

@@ -23,7 +23,7 @@ from shutil import copyfile
 import numpy as np
 import pycolmap
 
-from audit.cli.main import main as sfm_audit
+from sfm_audit.audit.cli.main import main as sfm_audit
 
 PHOTOS = (
     Path(__file__).resolve().parents[2] / "shared/corpus/megadepth_like/MegaDepth_v1_SfM/9001/images"

@@ -1,4 +1,4 @@
-"""Stand-ins for audit.runner.audit_one that are slow, die or fail; worker processes import them by name."""
+"""Stand-ins for audit.schedule.task.audit_one that are slow, die or fail; worker processes import them by name."""
 
 import os
 import signal
@@ -8,8 +8,8 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from audit import engine
-from audit.runner import Outcome, Task, audit_one
+from sfm_audit.audit.engine import model as engine
+from sfm_audit.audit.schedule.runner import Outcome, Task, audit_one
 
 SECONDS = 0.4
 

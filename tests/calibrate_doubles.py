@@ -6,9 +6,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Estimate, estimate_of
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Estimate, estimate_of
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 D1 = ("f", "k1")
 D3 = ("f", "k1", "k2", "k3")

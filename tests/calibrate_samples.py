@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.degenerate import before_fold
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.degenerate import before_fold
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 SIZE = 1600
 FOCAL = 800.0

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from run_samples import STATE, make_ref, sample_table, settings
 
-from reports.reader import RunReader
-from reports.store import RunStore
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
 
 NASTY = (
     "<script>alert('1')</script>.jpg",

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from audit.cameras import project, project_with_jacobians
-from audit.misfit import candidate_fields, nuisance_columns, project_image
-from audit.misfit.fields import GROUP_COLUMNS
-from audit.stationarity import pose_jacobian
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras import project, project_with_jacobians
+from sfm_audit.audit.inliers.stationarity import pose_jacobian
+from sfm_audit.audit.misfit import candidate_fields, nuisance_columns, project_image
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord
 
 WIDTH, HEIGHT, FOCAL = 1600, 1200, 1000.0
 PARAMS = {

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from run_samples import STATE, make_ref, sample_table, sample_tables, settings
 
-from reports.reader import RunReader
-from reports.store import RunStore
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
 
 NASTY_NAMES = [
     "<script>window.hacked = true</script>.jpg",

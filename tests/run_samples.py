@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pycolmap
 
-from audit.table import build_table, schema
-from loaders import ModelRef
-from loaders.input_state import InputState
-from reports.store import RunSettings
+from sfm_audit.audit.table import build_table, schema
+from sfm_audit.loaders import ModelRef
+from sfm_audit.loaders.datasets.input_state import InputState
+from sfm_audit.reports.run_folder.store import RunSettings
 
 CONFIG = {
     "noise": "track",
@@ -114,9 +114,9 @@ def part_times(run: Path) -> dict[str, int]:
 
 def start_cli(*args: str | Path, stub: str | None = None, **options: Any) -> subprocess.Popen[str]:
     """Start sfm-audit in a process of its own; ``stub`` names a function of audit_stubs that audits in its place."""
-    code = "from audit.cli.main import entry_point"
+    code = "from sfm_audit.audit.cli.main import entry_point"
     if stub:
-        code += "\nimport functools, audit_stubs, audit.cli.auditing as auditing"
+        code += "\nimport functools, audit_stubs, sfm_audit.audit.cli.auditing as auditing"
         code += f"\nauditing.audit_many = functools.partial(auditing.audit_many, audit=audit_stubs.{stub})"
     code += "\nentry_point()"
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}

@@ -9,14 +9,14 @@ from typing import Any, Final
 import numpy as np
 import pycolmap
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.consensus import CentredPoints
-from audit.calibrate.degenerate import check_camera, check_consensus, check_points
-from audit.calibrate.eaprd import centred_camera
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate, estimate_of
-from audit.calibrate.refine import Fit, fit_at
-from loaders.arrays import BoolArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.consensus import CentredPoints
+from sfm_audit.audit.calibrate.degenerate import check_camera, check_consensus, check_points
+from sfm_audit.audit.calibrate.eaprd import centred_camera
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate, estimate_of
+from sfm_audit.audit.calibrate.refine import Fit, fit_at
+from sfm_audit.loaders.arrays import BoolArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _MODELS: Final = {1: "SIMPLE_RADIAL", 2: "RADIAL"}
 _FOCAL_OVER_SIZE: Final = (1.2, 0.6, 2.4)  # COLMAP's first guess without EXIF, half and twice of it

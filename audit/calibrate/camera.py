@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from scipy.optimize.elementwise import find_root
 
-from audit.cameras import project_with_jacobians
-from audit.misfit import ProjectedImage
-from audit.stationarity import pose_jacobian
-from loaders.arrays import FloatArray
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras import project_with_jacobians
+from sfm_audit.audit.inliers.stationarity import pose_jacobian
+from sfm_audit.audit.misfit import ProjectedImage
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord
 
 _REAL: Final = 1e-9  # imaginary share of a root that counts as real
 _FIRST_REACH: Final = 2.0  # normalised radius, 63 degrees

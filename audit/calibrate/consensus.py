@@ -9,19 +9,19 @@ from typing import Final
 
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.degenerate import check_camera, check_consensus, check_points, extents_of
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate, estimate_of
-from audit.calibrate.radial_pose import (
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.degenerate import check_camera, check_consensus, check_points, extents_of
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate, estimate_of
+from sfm_audit.audit.calibrate.radial_pose import (
     SAMPLE_SIZE,
     Starts,
     complete,
     minimal_radial_poses,
     robust_radial_pose,
 )
-from audit.calibrate.refine import Fit, fit_at, refine
-from loaders.arrays import BoolArray, FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.refine import Fit, fit_at, refine
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _FEW_OUTLIERS: Final = 0.15  # share up to which the radial consensus is a good enough start
 _SHALLOW: Final = 0.1  # third / second extent below which the mirrored plane has the same directions

@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate
-from loaders.arrays import BoolArray, FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError, Estimate
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 FLAT: Final = 1e-7
 """Extent of points across a line, as a share of that along, at or below which they are on it."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.consensus import estimate_radial_camera
-from audit.calibrate.estimate import Estimate
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.consensus import estimate_radial_camera
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _COEFFICIENTS = ("k1", "k2", "k3")
 

@@ -9,12 +9,12 @@ from typing import Protocol
 
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera
-from audit.identifiability import POSE_NAMES, ParameterCovariance, parameter_covariance
-from audit.misfit import ProjectedImage
-from audit.noise import fit_constant_variance
-from loaders.arrays import BoolArray, FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
+from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, ParameterCovariance, parameter_covariance
+from sfm_audit.audit.misfit import ProjectedImage
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 
 class Degeneracy(StrEnum):
@@ -45,7 +45,7 @@ class Estimate:
     name: of the estimator and its model ("D1", "D3", "pnprf", "colmap").          camera: see `CalibratedCamera`.
     rotation_cam_from_world: (3, 3).          translation_cam_from_world: (3,) model units.
     inliers: (n,) which correspondences the estimator kept.          residuals_px: (n, 2) observed - projected, of all.
-    covariance: of the pose (`audit.identifiability.POSE_NAMES`) and ``camera.estimated``, points taken as exact.
+    covariance: of the pose (`identifiability.POSE_NAMES`) and ``camera.estimated``, points taken as exact.
     """
 
     name: str

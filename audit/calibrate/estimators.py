@@ -9,11 +9,11 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from audit.calibrate.absolute_pose import absolute_pose
-from audit.calibrate.eaprd import eaprd
-from audit.calibrate.estimate import Estimate, Estimator
-from audit.calibrate.pnprf import pnprf
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.absolute_pose import absolute_pose
+from sfm_audit.audit.calibrate.eaprd import eaprd
+from sfm_audit.audit.calibrate.estimate import Estimate, Estimator
+from sfm_audit.audit.calibrate.pnprf import pnprf
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 
 class _Adjustable(Protocol):

@@ -8,14 +8,14 @@ from typing import Final
 
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Estimate
-from audit.expected_error import GRID, ExpectedErrorMap, cell_centres_px, measurement_error_px
-from audit.identifiability import POSE_NAMES, Identifiability
-from audit.plausibility import CameraPlausibility, folds_over
-from audit.verdict import Reason, ReasonCode
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.audit.camera_quality.expected_error import GRID, ExpectedErrorMap, cell_centres_px, measurement_error_px
+from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, Identifiability
+from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, folds_over
+from sfm_audit.audit.decision.verdict import Reason, ReasonCode
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _FLAT: Final = 1e-2  # planarity: a metre of points is within a centimetre of a plane
 _FRONTO_PARALLEL_DEG: Final = 5.0
@@ -61,7 +61,7 @@ def fronto_parallel_reason(geometry: PlaneGeometry, estimate: Estimate) -> Reaso
 
 
 def identifiability_of(estimate: Estimate) -> Identifiability:
-    """Summarise the covariance of an estimate; see `audit.identifiability.identifiability`."""
+    """Summarise the covariance of an estimate; see `audit.camera_quality.identifiability.identifiability`."""
     camera, parameters = estimate.camera, estimate.covariance
     values = {"f": camera.focal_px[0], "fx": camera.focal_px[0], "fy": camera.focal_px[1]}
     focals = [(parameters.sd_of(name), values[name]) for name in _FOCALS if name in camera.estimated]
@@ -93,7 +93,7 @@ def plausibility_of(camera: CalibratedCamera) -> CameraPlausibility:
 
 
 def camera_folds(camera: CalibratedCamera) -> bool:
-    """Whether the distortion folds inside the image; see `audit.plausibility.folds_over`.
+    """Whether the distortion folds inside the image; see `audit.camera_quality.plausibility.folds_over`.
 
     A division model folds where no ray reaches a pixel between the principal point and the farthest corner.
     """
@@ -115,7 +115,7 @@ def expected_error_of(estimate: Estimate, correspondences: Correspondences, sigm
 
     Notes
     -----
-    method.md section 6 as `audit.expected_error.expected_error_map` has it, on each pixel's ray at the median distance
+    method.md section 6 as `expected_error_map` has it, on each pixel's ray at the median distance
     of the inliers; NaN where no ray reaches the pixel, everywhere where the covariance is unknown.
     """
     camera = estimate.camera

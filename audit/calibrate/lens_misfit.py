@@ -6,13 +6,13 @@ from typing import Final
 
 import numpy as np
 
-from audit.calibrate.estimate import Estimate
-from audit.calibrate.lidar import lidar_predictors
-from audit.misfit import MisfitTests, candidate_fields, coincident_keypoints, prepare
-from audit.misfit.fields import GROUP_COLUMNS
-from audit.standardise import ImageNoise
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.audit.calibrate.lidar import lidar_predictors
+from sfm_audit.audit.misfit import MisfitTests, candidate_fields, coincident_keypoints, prepare
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.audit.noise.standardise import ImageNoise
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _SHORTEST: Final = 0.03  # of a field's length: what must be left of it off N where the noise of the points is unknown
 _SPAN: Final = 1e-9  # of the largest singular value of unit columns, as in method.md section 5, step 1

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from audit.calibrate.estimate import Estimate
-from audit.noise import fit_constant_variance, fit_variance
-from audit.noise_variants import fit_variance_likelihood
-from audit.standardise import ImageNoise
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
+from sfm_audit.audit.noise.standardise import ImageNoise
+from sfm_audit.audit.noise.variants import fit_variance_likelihood
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 
 def lidar_predictors(estimate: Estimate, correspondences: Correspondences) -> FloatArray:

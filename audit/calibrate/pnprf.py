@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from audit.calibrate.camera import Distortion
-from audit.calibrate.consensus import estimate_radial_camera
-from audit.calibrate.eaprd import centred_camera
-from audit.calibrate.estimate import Estimate
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import Distortion
+from sfm_audit.audit.calibrate.consensus import estimate_radial_camera
+from sfm_audit.audit.calibrate.eaprd import centred_camera
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 
 def pnprf(correspondences: Correspondences, rng: np.random.Generator, *, threshold_px: float = 5.0) -> Estimate:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import poselib
 
-from loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 SAMPLE_SIZE: Final = 5
 _SEEDS: Final = 2**31 - 1

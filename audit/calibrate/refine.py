@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera
-from audit.misfit import ProjectedImage
-from loaders.arrays import BoolArray, FloatArray
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
+from sfm_audit.audit.misfit import ProjectedImage
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
 
 _CHANGE: Final = 1e-10  # relative, of cost and parameters, below which the optimum is reached
 _ROUGH_CHANGE: Final = 1e-4  # before the inliers are selected again

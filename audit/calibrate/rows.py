@@ -1,4 +1,4 @@
-"""From validations to the rows of the tables ``calibration`` and ``calibration_residuals`` (audit/table.py)."""
+"""From validations to the rows of the tables ``calibration`` and ``calibration_residuals`` (audit/table/columns.py)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from audit.arrow import Coded, Values, build_table
-from audit.calibrate.estimate import DegenerateInputError, Estimate
-from audit.calibrate.evidence import correlation_focal_depth
-from audit.calibrate.validation import Validation, degenerate_judgement
-from audit.normality import NormalityTests
-from audit.rows import cause_columns, misfit_columns, normality_columns
-from audit.table import schema
-from audit.verdict import Verdict
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimate
+from sfm_audit.audit.calibrate.evidence import correlation_focal_depth
+from sfm_audit.audit.calibrate.validation import Validation, degenerate_judgement
+from sfm_audit.audit.decision.verdict import Verdict
+from sfm_audit.audit.engine.rows import cause_columns, misfit_columns, normality_columns
+from sfm_audit.audit.normality import NormalityTests
+from sfm_audit.audit.table import schema
+from sfm_audit.audit.table.arrow import Coded, Values, build_table
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 Row = dict[str, Any]
 

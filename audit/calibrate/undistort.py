@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from audit.calibrate.camera import CalibratedCamera
-from loaders.arrays import FloatArray
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
+from sfm_audit.loaders.arrays import FloatArray
 
 _BLOCK_PIXELS: Final = 1 << 18  # projected at once, so that derivatives nobody needs do not fill the memory
 _NOWHERE: Final = -1e4  # outside of any image: cv2.remap takes no NaN

@@ -8,8 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from audit.calibrate.estimate import DegenerateInputError, Estimate
-from audit.calibrate.evidence import (
+from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimate
+from sfm_audit.audit.calibrate.evidence import (
     PlaneGeometry,
     expected_error_of,
     fronto_parallel_reason,
@@ -17,23 +17,23 @@ from audit.calibrate.evidence import (
     plane_geometry,
     plausibility_of,
 )
-from audit.calibrate.lens_misfit import misfit_tests
-from audit.calibrate.lidar import lidar_noise, lidar_predictors
-from audit.config import AuditConfig
-from audit.coverage import coverage, occupied_cells
-from audit.expected_error import ExpectedErrorMap
-from audit.identifiability import Identifiability
-from audit.image_audit import Judgements, exact_projections, limits_of, no_noise
-from audit.misfit import GROUPS, MisfitTests
-from audit.misfit_verdict import Misfit, find_misfit, judge_misfit
-from audit.multiplicity import holm
-from audit.normality import NormalityTests, normality_tests
-from audit.plausibility import CameraPlausibility, judge_plausible, judge_pose
-from audit.standardise import ImageNoise, constant_noise
-from audit.stationarity import pose_offset_px
-from audit.verdict import Judgement, Reason, ReasonCode, Verdict, judge_ks
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.lens_misfit import misfit_tests
+from sfm_audit.audit.calibrate.lidar import lidar_noise, lidar_predictors
+from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
+from sfm_audit.audit.camera_quality.expected_error import ExpectedErrorMap
+from sfm_audit.audit.camera_quality.identifiability import Identifiability
+from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, judge_plausible, judge_pose
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.misfit import Misfit, find_misfit, judge_misfit
+from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict, judge_ks
+from sfm_audit.audit.engine.image import Judgements, exact_projections, limits_of, no_noise
+from sfm_audit.audit.inliers.stationarity import pose_offset_px
+from sfm_audit.audit.misfit import GROUPS, MisfitTests
+from sfm_audit.audit.misfit.multiplicity import holm
+from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
+from sfm_audit.audit.normality import NormalityTests, normality_tests
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 NoiseChoice = Literal["auto", "constant", "lidar"]
 

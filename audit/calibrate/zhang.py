@@ -13,10 +13,10 @@ from typing import Final, Literal, get_args
 import cv2
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 ZhangModel = Literal["M1", "M2", "M3", "M4", "M5"]
 MODELS: Final = MappingProxyType(

@@ -7,7 +7,7 @@ plane, ``rational`` the models that distort the ray itself, ``fisheye`` the equi
 
 from __future__ import annotations
 
-from audit.cameras.projection import (
+from sfm_audit.audit.cameras.projection import (
     Projection,
     distorted_normalised,
     is_fisheye,
@@ -16,7 +16,7 @@ from audit.cameras.projection import (
     project_columns,
     project_with_jacobians,
 )
-from audit.cameras.unprojection import unproject
+from sfm_audit.audit.cameras.unprojection import unproject
 
 __all__ = [
     "Projection",

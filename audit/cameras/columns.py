@@ -7,7 +7,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 EPSILON: Final = float(np.finfo(np.float64).eps)
 """Smallest Zc that COLMAP projects (HasProjectableDepth in src/colmap/sensor/models.h)."""

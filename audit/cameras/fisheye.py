@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.cameras.columns import Plane, Want, in_front
-from audit.cameras.warps import WarpFunction
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras.columns import Plane, Want, in_front
+from sfm_audit.audit.cameras.warps import WarpFunction
+from sfm_audit.loaders.arrays import FloatArray
 
 NEAR_AXIS: Final = 1e-3
 """tan(theta)^2 below which the curvature of theta / tan(theta) comes from its series (cancellation otherwise)."""

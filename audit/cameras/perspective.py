@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from audit.cameras.columns import Plane, Want, in_front
-from audit.cameras.warps import WarpFunction
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras.columns import Plane, Want, in_front
+from sfm_audit.audit.cameras.warps import WarpFunction
+from sfm_audit.loaders.arrays import FloatArray
 
 
 def perspective_plane(

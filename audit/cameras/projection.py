@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from audit.cameras.columns import Plane, Want, in_front
-from audit.cameras.fisheye import angle_gain, fisheye_plane
-from audit.cameras.perspective import perspective_plane
-from audit.cameras.rational import RATIONAL_PLANES
-from audit.cameras.spherical import spherical_plane
-from audit.cameras.warps import WARPS
-from loaders.arrays import FloatArray, IntArray
-from loaders.camera_models import CameraModel
+from sfm_audit.audit.cameras.columns import Plane, Want, in_front
+from sfm_audit.audit.cameras.fisheye import angle_gain, fisheye_plane
+from sfm_audit.audit.cameras.perspective import perspective_plane
+from sfm_audit.audit.cameras.rational import RATIONAL_PLANES
+from sfm_audit.audit.cameras.spherical import spherical_plane
+from sfm_audit.audit.cameras.warps import WARPS
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.camera_models import CameraModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

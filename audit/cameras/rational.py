@@ -10,8 +10,8 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from audit.cameras.columns import EPSILON, Plane, Want, in_front
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras.columns import EPSILON, Plane, Want, in_front
+from sfm_audit.loaders.arrays import FloatArray
 
 PlaneFunction: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, Sequence[float], Want], Plane]
 Columns3: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]

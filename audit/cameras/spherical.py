@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from audit.cameras.columns import EPSILON, Plane, Want
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras.columns import EPSILON, Plane, Want
+from sfm_audit.loaders.arrays import FloatArray
 
 
 def spherical_plane(x: FloatArray, y: FloatArray, z: FloatArray, want: Want) -> Plane:

@@ -7,13 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from audit.cameras.columns import EPSILON, Want
-from audit.cameras.projection import check_shapes, extra_params, is_fisheye, scale_and_shift
-from audit.cameras.rational import RATIONAL_DEPTHS
-from audit.cameras.spherical import spherical_rays
-from audit.cameras.warps import WARPS, WarpFunction, radial, radial_gain
-from loaders.arrays import BoolArray, FloatArray
-from loaders.camera_models import CameraModel
+from sfm_audit.audit.cameras.columns import EPSILON, Want
+from sfm_audit.audit.cameras.projection import check_shapes, extra_params, is_fisheye, scale_and_shift
+from sfm_audit.audit.cameras.rational import RATIONAL_DEPTHS
+from sfm_audit.audit.cameras.spherical import spherical_rays
+from sfm_audit.audit.cameras.warps import WARPS, WarpFunction, radial, radial_gain
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
 
 MAX_ITERATIONS: Final = 100
 STEP: Final = 0.25

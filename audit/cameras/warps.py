@@ -18,8 +18,8 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from audit.cameras.columns import Column, Want, Warp
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras.columns import Column, Want, Warp
+from sfm_audit.loaders.arrays import FloatArray
 
 Pair: TypeAlias = tuple[Column, Column]
 WarpFunction: TypeAlias = Callable[[FloatArray, FloatArray, Sequence[float], Want], Warp]

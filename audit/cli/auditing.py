@@ -12,20 +12,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.finding import Wanted, find_models
-from audit.cli.progress import Progress
-from audit.config import AuditConfig
-from audit.runner import audit_many
-from audit.schedule.errors import ClusterError
-from audit.schedule.processes import BYTES_WORTH_A_PROCESS
-from loaders import Discovery
-from reports.drawing import Page
-from reports.errors import OutputError, RunFolderError
-from reports.reader import RunReader
-from reports.store import RunSettings, RunStore
-from reports.summary import render_summary
-from reports.wording import plain
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.finding import Wanted, find_models
+from sfm_audit.audit.cli.progress import Progress
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.schedule.errors import ClusterError
+from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
+from sfm_audit.audit.schedule.runner import audit_many
+from sfm_audit.loaders import Discovery
+from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunSettings, RunStore
+from sfm_audit.reports.text.drawing import Page
+from sfm_audit.reports.text.summary import render_summary
+from sfm_audit.reports.text.wording import plain
 
 
 @dataclass(frozen=True, slots=True)

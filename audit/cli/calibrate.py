@@ -8,15 +8,15 @@ from typing import Any, Final, get_args
 
 import click
 
-from audit.cli.auditing import print_page, terminal_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.extras import extra
-from audit.config import AuditConfig, PolicyName
-from loaders.errors import LoadError
-from reports.calibration import render_calibration
-from reports.drawing import Page
-from reports.errors import OutputError
-from reports.new_files import new_folder
+from sfm_audit.audit.cli.auditing import print_page, terminal_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.extras import extra
+from sfm_audit.audit.config import AuditConfig, PolicyName
+from sfm_audit.loaders.errors import LoadError
+from sfm_audit.reports.errors import OutputError
+from sfm_audit.reports.run_folder.new_files import new_folder
+from sfm_audit.reports.text.calibration import render_calibration
+from sfm_audit.reports.text.drawing import Page
 
 CALIBRATION_FILE: Final = "calibration.parquet"
 RESIDUALS_FILE: Final = "residuals.parquet"
@@ -81,7 +81,7 @@ def command(*, correspondences: str, out: Path | None, **options: Any) -> ExitCo
     if out is not None:
         _refuse_taken(out, force=options["force"])
     with extra("calibrate"):
-        from audit.cli.calibration import Request, calibrate  # noqa: PLC0415 - needs the extra
+        from sfm_audit.audit.cli.calibration import Request, calibrate  # noqa: PLC0415 - needs the extra
     config = AuditConfig(
         noise="constant",
         points=options["points"],

@@ -18,18 +18,18 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from audit.calibrate.estimate import DegenerateInputError
-from audit.calibrate.estimators import estimator
-from audit.calibrate.rows import Row, calibration_row, calibration_table, degenerate_row, residuals_table
-from audit.calibrate.undistort import undistort_image
-from audit.calibrate.validation import NoiseChoice, Validation, validate
-from audit.config import AuditConfig
-from loaders.correspondences import Correspondences
-from loaders.correspondences_table import read_correspondences
-from loaders.errors import LoadError, MalformedFileError, MissingFileError
-from loaders.scan_ptx import read_ptx
-from reports import figures
-from reports.figures import Residuals
+from sfm_audit.audit.calibrate.estimate import DegenerateInputError
+from sfm_audit.audit.calibrate.estimators import estimator
+from sfm_audit.audit.calibrate.rows import Row, calibration_row, calibration_table, degenerate_row, residuals_table
+from sfm_audit.audit.calibrate.undistort import undistort_image
+from sfm_audit.audit.calibrate.validation import NoiseChoice, Validation, validate
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.loaders.correspondences.records import Correspondences
+from sfm_audit.loaders.correspondences.scan_ptx import read_ptx
+from sfm_audit.loaders.correspondences.table import read_correspondences
+from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileError
+from sfm_audit.reports import figures
+from sfm_audit.reports.figures import Residuals
 
 CALIBRATION_FILE: Final = "calibration.parquet"
 RESIDUALS_FILE: Final = "residuals.parquet"

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import click
 
-from audit.cli.auditing import print_page, terminal_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.gate_file import read_gate_file
-from audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
-from reports.comparison import compare
-from reports.comparison_page import OTHER_NAMES, render_gate
-from reports.gate import judge
-from reports.gate_policy import GatePolicy
-from reports.gate_report import GateReport, render_json
-from reports.junit import render_junit
-from reports.markdown import render_markdown
-from reports.wording import counted
+from sfm_audit.audit.cli.auditing import print_page, terminal_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.gate_file import read_gate_file
+from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
+from sfm_audit.reports.compare.comparison import compare
+from sfm_audit.reports.compare.gate import judge
+from sfm_audit.reports.compare.gate_policy import GatePolicy
+from sfm_audit.reports.compare.gate_report import GateReport, render_json
+from sfm_audit.reports.compare.junit import render_junit
+from sfm_audit.reports.compare.markdown import render_markdown
+from sfm_audit.reports.compare.page import OTHER_NAMES, render_gate
+from sfm_audit.reports.text.wording import counted
 
 _FILE = click.Path(path_type=Path)
 

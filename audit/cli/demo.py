@@ -12,18 +12,18 @@ from typing import Final
 import click
 import numpy as np
 
-from audit.cli.auditing import RunRequest, print_page, print_summary, run_audit, terminal_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.config import AuditConfig
-from audit.simulate.adjust import write_adjusted_model
-from audit.simulate.defects import DefectKind
-from audit.simulate.demo import TruthRecord, demo_scene, truth_records
-from audit.simulate.scene import simulate_scene
-from audit.verdict import ReasonCode, Verdict
-from reports.drawing import Field, Listing, draw
-from reports.reader import Row, RunReader
-from reports.reasons import is_remark
-from reports.wording import MISSING, counted, paragraph
+from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit, terminal_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
+from sfm_audit.audit.simulate.adjust import write_adjusted_model
+from sfm_audit.audit.simulate.defects import DefectKind
+from sfm_audit.audit.simulate.demo import TruthRecord, demo_scene, truth_records
+from sfm_audit.audit.simulate.scene import simulate_scene
+from sfm_audit.reports.run_folder.reader import Row, RunReader
+from sfm_audit.reports.text.drawing import Field, Listing, draw
+from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.reports.text.wording import MISSING, counted, paragraph
 
 TRUTH_FILE: Final = "truth.json"
 MARK: Final = "sfm-audit demo"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
-from audit.cli.auditing import print_page, terminal_page
-from audit.cli.errors import ExitCode
-from audit.cli.runs import different_settings, read_run
-from reports.comparison import compare
-from reports.comparison_page import render_comparison
-from reports.wording import plain
+from sfm_audit.audit.cli.auditing import print_page, terminal_page
+from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.cli.runs import different_settings, read_run
+from sfm_audit.reports.compare.comparison import compare
+from sfm_audit.reports.compare.page import render_comparison
+from sfm_audit.reports.text.wording import plain
 
 
 @click.command("diff", short_help="Show what changed between two runs.")

@@ -7,15 +7,15 @@ from typing import Any, Final, get_args
 
 import click
 
-from audit.cli.auditing import print_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.extras import extra
-from audit.cli.settings import read_config
-from audit.config import NoiseName, PointsName, PolicyName
-from loaders import LoadError, SparseModel, discover, open_model
-from reports.errors import OutputError
-from reports.new_files import new_folder
-from reports.wording import plain
+from sfm_audit.audit.cli.auditing import print_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.extras import extra
+from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.config import NoiseName, PointsName, PolicyName
+from sfm_audit.loaders import LoadError, SparseModel, discover, open_model
+from sfm_audit.reports.errors import OutputError
+from sfm_audit.reports.run_folder.new_files import new_folder
+from sfm_audit.reports.text.wording import plain
 
 STORY_FILE: Final = "story.txt"
 _SETTINGS: Final = ("noise", "points", "min_effect", "policy")
@@ -46,8 +46,8 @@ def command(*, model: str, image: str, out: Path, config_file: Path | None, **op
     _refuse_taken(out, force=options["force"])
     config = read_config(config_file, {name: options[name] for name in _SETTINGS})
     with extra("report"):
-        from audit.cli.image_story import tell  # noqa: PLC0415 - needs the extra
-        from audit.cli.recompute import auditor_of  # noqa: PLC0415
+        from sfm_audit.audit.cli.image_story import tell  # noqa: PLC0415 - needs the extra
+        from sfm_audit.audit.cli.recompute import auditor_of  # noqa: PLC0415
     try:
         opened = open_model(_location(model))
         image_idx = _image_idx(opened, image)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
 
 
 @contextmanager

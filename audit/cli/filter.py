@@ -12,16 +12,24 @@ from typing import Final
 import click
 import numpy as np
 
-from audit.cli.errors import ExitCode, KnownError
-from loaders import LoadError, open_model
-from loaders.scene_info import read_scene_info
-from reports.errors import OutputError, RunFolderError
-from reports.new_files import OutputExistsError, check_free, new_folder, write_file
-from reports.pruned_model import MODEL_FILES, plan_pruning, write_pruned
-from reports.reader import RunReader
-from reports.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
-from reports.selection import AuditedImage, Keep, as_bytes, images_of_model, list_text, read_images, removed_text
-from reports.wording import counted, plain
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.loaders import LoadError, open_model
+from sfm_audit.loaders.scene_info.file import read_scene_info
+from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.export.pruned_model import MODEL_FILES, plan_pruning, write_pruned
+from sfm_audit.reports.export.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
+from sfm_audit.reports.export.selection import (
+    AuditedImage,
+    Keep,
+    as_bytes,
+    images_of_model,
+    list_text,
+    read_images,
+    removed_text,
+)
+from sfm_audit.reports.run_folder.new_files import OutputExistsError, check_free, new_folder, write_file
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.text.wording import counted, plain
 
 _REMOVED: Final = ".removed.csv"
 _PATH: Final = click.Path(path_type=Path)

@@ -9,13 +9,13 @@ from typing import Any, Final, TypeVar
 
 import click
 
-from audit.cli.errors import ExitCode, KnownError
-from loaders import Discovery, LoadError, discover
-from loaders.glance import count_images_of
-from loaders.layouts import LAYOUTS
-from loaders.locations import parse_location
-from loaders.selection import Selection, read_scene_list, select
-from reports.wording import plain
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.loaders import Discovery, LoadError, discover
+from sfm_audit.loaders.datasets.image_counts import count_images_of
+from sfm_audit.loaders.datasets.layouts import LAYOUTS
+from sfm_audit.loaders.datasets.selection import Selection, read_scene_list, select
+from sfm_audit.loaders.paths.locations import parse_location
+from sfm_audit.reports.text.wording import plain
 
 UNKNOWN: Final = "-"
 _Command = TypeVar("_Command", bound=Callable[..., Any])

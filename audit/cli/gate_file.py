@@ -9,9 +9,9 @@ from typing import Any, Final
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from audit.cli.errors import ExitCode, KnownError
-from audit.verdict import ReasonCode
-from reports.gate_policy import Band, GatePolicy, Limits, PartPolicy
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.decision.verdict import ReasonCode
+from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits, PartPolicy
 
 _KEYS_OF: Final[dict[str, type[BaseModel]]] = {
     "limits": Limits,

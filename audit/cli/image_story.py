@@ -11,15 +11,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
-from audit.cli.recompute import image_residuals_of, tau_px
-from audit.engine import ModelAuditor
-from audit.expected_error import expected_error_map, median_depth
-from audit.misfit import MisfitGroup, prepare_image
-from audit.table import ModelLabels
-from loaders.arrays import FloatArray
-from reports import figures
-from reports.explain import Story, render_story, strongest_where
-from reports.figures import CAPTIONS, Residuals
+from sfm_audit.audit.camera_quality.expected_error import expected_error_map, median_depth
+from sfm_audit.audit.cli.recompute import image_residuals_of, tau_px
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.misfit import MisfitGroup, prepare_image
+from sfm_audit.audit.table import ModelLabels
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports import figures
+from sfm_audit.reports.figures import CAPTIONS, Residuals
+from sfm_audit.reports.text.explain import Story, render_story, strongest_where
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from audit.cli.auditing import print_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
-from reports.learning import gate_toml, learn_bands
-from reports.wording import plain
+from sfm_audit.audit.cli.auditing import print_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
+from sfm_audit.reports.compare.learning import gate_toml, learn_bands
+from sfm_audit.reports.text.wording import plain
 
 _RECOMMENDED = 3
 

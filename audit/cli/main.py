@@ -9,7 +9,7 @@ from typing import Final, cast
 
 import click
 
-from audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -38,7 +38,9 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in VERBS:
             return None
-        return cast("click.Command", importlib.import_module(f"audit.cli.{cmd_name.replace('-', '_')}").command)
+        return cast(
+            "click.Command", importlib.import_module(f"sfm_audit.audit.cli.{cmd_name.replace('-', '_')}").command
+        )
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""

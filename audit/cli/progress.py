@@ -8,7 +8,7 @@ from typing import Self
 
 from tqdm import tqdm
 
-from loaders import ModelRef
+from sfm_audit.loaders import ModelRef
 
 
 class Progress:

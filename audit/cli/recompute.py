@@ -9,15 +9,15 @@ import numpy as np
 from pydantic import ValidationError
 from threadpoolctl import threadpool_limits
 
-from audit.config import AuditConfig
-from audit.engine import ModelAuditor
-from loaders import LoadError, MissingFileError, SparseModel, open_model
-from loaders.arrays import FloatArray
-from loaders.colmap_database import find_database, read_keypoint_shapes
-from loaders.input_state import read_input_state
-from reports.figures import ResidualError, Residuals
-from reports.figures.residuals import principal_point, residuals_of_row
-from reports.reader import RunReader
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.loaders import LoadError, MissingFileError, SparseModel, open_model
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders.datasets.input_state import read_input_state
+from sfm_audit.reports.figures import ResidualError, Residuals
+from sfm_audit.reports.figures.residuals import principal_point, residuals_of_row
+from sfm_audit.reports.run_folder.reader import RunReader
 
 
 class ResidualSource:

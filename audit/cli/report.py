@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from audit.cli.auditing import print_page
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.extras import extra
-from reports.errors import OutputError, RunFolderError
-from reports.new_files import OutputExistsError, check_free, write_file
-from reports.reader import RunReader
-from reports.wording import counted, plain
+from sfm_audit.audit.cli.auditing import print_page
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.extras import extra
+from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.run_folder.new_files import OutputExistsError, check_free, write_file
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.text.wording import counted, plain
 
 
 @click.command("report", short_help="Write one HTML page about a run, to look at and to send.")
@@ -40,7 +40,7 @@ def command(*, run: Path, out: Path, photos: Path | None, worst: int, force: boo
             raise KnownError(f"{photos}: is no folder; name the folder of the photos", ExitCode.USAGE)
         reader = _open(run)
         with extra("report"):
-            from audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
+            from sfm_audit.audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
         page = make_page(reader, photos, worst, silent=quiet or not sys.stderr.isatty())
         content = page.text.encode()
         write_file(out, content)

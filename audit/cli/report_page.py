@@ -8,13 +8,13 @@ from pathlib import Path
 import pyarrow as pa
 from tqdm import tqdm
 
-from audit.cli.recompute import ResidualSource, tau_px
-from reports import html
-from reports.errors import RunFolderError
-from reports.figures import ResidualError
-from reports.html.photos import find_photo, read_photo
-from reports.reader import Row, RunReader
-from reports.wording import plain
+from sfm_audit.audit.cli.recompute import ResidualSource, tau_px
+from sfm_audit.reports import html
+from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.figures import ResidualError
+from sfm_audit.reports.html.photos import find_photo, read_photo
+from sfm_audit.reports.run_folder.reader import Row, RunReader
+from sfm_audit.reports.text.wording import plain
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ from typing import Any, get_args
 
 import click
 
-from audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
-from audit.cli.errors import ExitCode
-from audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
-from audit.cli.settings import read_config
-from audit.config import AuditConfig, NoiseName, PointsName, PolicyName
+from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
+from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
+from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName, PolicyName
 
 _DEFAULTS = AuditConfig()
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from audit.cli.errors import ExitCode, KnownError
-from reports.comparison import MissingColumnError, RunSnapshot
-from reports.errors import RunFolderError
-from reports.reader import RunReader
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
+from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.run_folder.reader import RunReader
 
 
 @dataclass(frozen=True, slots=True, eq=False)

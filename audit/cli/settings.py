@@ -10,8 +10,8 @@ from typing import Any, Final
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from audit.cli.errors import ExitCode, KnownError
-from audit.config import AuditConfig
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.config import AuditConfig
 
 _CROSS_FIELD: Final = "value_error"  # a rule about several settings, each of which is valid by itself
 _PATTERNS: Final = {"min_effect": "a number with its unit, such as 0.2px or 0.5sigma"}

@@ -11,16 +11,16 @@ from typing import Any, Final
 import click
 import numpy as np
 
-from audit.calibrate.camera import CalibratedCamera
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.extras import extra
-from audit.simulate.board import BoardSet, BoardSpec, iterate_boards
-from audit.simulate.room import ROOM_CAMERAS, RoomSet, RoomSpec, room_sets
-from loaders.arrays import UInt8Array
-from loaders.correspondences import Correspondences
-from reports.errors import OutputError
-from reports.new_files import new_folder
-from reports.wording import counted
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.extras import extra
+from sfm_audit.audit.simulate.board import BoardSet, BoardSpec, iterate_boards
+from sfm_audit.audit.simulate.room import ROOM_CAMERAS, RoomSet, RoomSpec, room_sets
+from sfm_audit.loaders.arrays import UInt8Array
+from sfm_audit.loaders.correspondences.records import Correspondences
+from sfm_audit.reports.errors import OutputError
+from sfm_audit.reports.run_folder.new_files import new_folder
+from sfm_audit.reports.text.wording import counted
 
 TRUTH_FILE: Final = "truth.json"
 MARK: Final = "sfm-audit simulate"
@@ -82,7 +82,7 @@ def _board(*, seed: int, num_sets: int | None, points_only: bool, with_images: b
     if points_only:
         return _Simulation(settings, iterate_boards(spec, seed, rendered=False))
     with extra("calibrate"):
-        from audit.simulate.render import DetectorError  # noqa: PLC0415 - needs the extra
+        from sfm_audit.audit.simulate.render import DetectorError  # noqa: PLC0415 - needs the extra
     return _Simulation(settings, _with_known_errors(iterate_boards(spec, seed, rendered=True), DetectorError))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from audit.misfit.cause import (
+from sfm_audit.audit.misfit.cause import (
     Retest,
     advised_camera_model,
     bic,
@@ -11,12 +11,12 @@ from audit.misfit.cause import (
     named_cause,
     remaining_groups,
 )
-from audit.misfit.clusters import coincident_keypoints
-from audit.misfit.fields import GROUPS, MisfitGroup, candidate_fields
-from audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
-from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
-from audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design
-from audit.misfit.score import PreparedImage, prepare, prepare_image
+from sfm_audit.audit.misfit.clusters import coincident_keypoints
+from sfm_audit.audit.misfit.fields import GROUPS, MisfitGroup, candidate_fields
+from sfm_audit.audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
+from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
+from sfm_audit.audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design
+from sfm_audit.audit.misfit.score import PreparedImage, prepare, prepare_image
 
 __all__ = [
     "GROUPS",

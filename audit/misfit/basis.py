@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.linalg.blas import dgemm
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md section 5, step 1)
 FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection

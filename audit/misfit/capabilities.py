@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.cameras import is_fisheye
-from loaders.arrays import FloatArray
-from loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
+from sfm_audit.audit.cameras import is_fisheye
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
 
 
 class Term(StrEnum):

@@ -9,14 +9,14 @@ from typing import Final
 
 import numpy as np
 
-from audit.misfit.capabilities import TERMS, Term, extended_params, larger_models, undistorted_model
-from audit.misfit.fields import GROUPS, MisfitGroup
-from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
-from audit.misfit.score import prepare_image
-from audit.multiplicity import holm
-from loaders.arrays import FloatArray
-from loaders.camera_models import CameraModel
-from loaders.model import CameraRecord
+from sfm_audit.audit.misfit.capabilities import TERMS, Term, extended_params, larger_models, undistorted_model
+from sfm_audit.audit.misfit.fields import GROUPS, MisfitGroup
+from sfm_audit.audit.misfit.multiplicity import holm
+from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
+from sfm_audit.audit.misfit.score import prepare_image
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
+from sfm_audit.loaders.model import CameraRecord
 
 Retest = Callable[[CameraRecord], MisfitTests]
 """The misfit tests of the same residuals if the camera had been fitted as this one, to first order."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
 def coincident_keypoints(xy_px: FloatArray) -> IntArray | None:

@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.misfit.nuisance import ProjectedImage
-from loaders.arrays import FloatArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.misfit.nuisance import ProjectedImage
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import CameraRecord
 
 
 class MisfitGroup(StrEnum):

@@ -7,11 +7,11 @@ from typing import cast
 
 import numpy as np
 
-from audit.cameras import normalised, project_columns
-from audit.stationarity import pose_columns
-from loaders.arrays import FloatArray
-from loaders.camera_models import CameraModel
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras import normalised, project_columns
+from sfm_audit.audit.inliers.stationarity import pose_columns
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
+from sfm_audit.loaders.model import CameraRecord
 
 
 @dataclass(frozen=True, slots=True, eq=False)

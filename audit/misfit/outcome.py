@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import special
 
-from audit.misfit.fields import MisfitGroup
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.misfit.fields import MisfitGroup
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 MIN_CLUSTERS_PER_RANK: Final = 4
 _SINGULAR_MEAT: Final = 1e-12  # smallest squared pivot of the meat with unit diagonal

@@ -14,12 +14,12 @@ from typing import Final, Literal
 
 import numpy as np
 
-from audit.misfit import basis
-from audit.misfit.fields import GROUP_COLUMNS, GROUPS, NUM_FIELDS, MisfitGroup, candidate_fields
-from audit.misfit.nuisance import fitted_param_idxs, project_image
-from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.misfit import basis
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, GROUPS, NUM_FIELDS, MisfitGroup, candidate_fields
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, project_image
+from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord
 
 _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns: below it, the triangular factor by QR
 

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from audit.misfit import basis
-from audit.misfit.fields import GROUP_COLUMNS, MisfitGroup, candidate_fields
-from audit.misfit.nuisance import nuisance_columns, project_image
-from audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_f, not_tested, refusal
-from loaders.arrays import FloatArray, IntArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.misfit import basis
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, MisfitGroup, candidate_fields
+from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_f, not_tested, refusal
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord
 
 _NO_TRANSFORM: Final = np.empty((0, 0))
 

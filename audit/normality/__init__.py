@@ -1,15 +1,15 @@
 """Goodness of fit of standardised residuals to N(0, 1): method.md section 4.
 
-In pytest modules write ``from audit import normality``: an imported name ``normality_tests`` would be collected.
+In pytest modules import the package: an imported name ``normality_tests`` would be collected.
 """
 
 from __future__ import annotations
 
-from audit.normality.battery import NormalityTests, normality_tests
-from audit.normality.distances import ks, ks_fitted, ks_norm, ks_norm_unscaled
-from audit.normality.moments import Shape, dagostino_pearson, sample_shape
-from audit.normality.outcome import Outcome
-from audit.normality.shapiro import shapiro_wilk, thin_observations
+from sfm_audit.audit.normality.battery import NormalityTests, normality_tests
+from sfm_audit.audit.normality.distances import ks, ks_fitted, ks_norm, ks_norm_unscaled
+from sfm_audit.audit.normality.moments import Shape, dagostino_pearson, sample_shape
+from sfm_audit.audit.normality.outcome import Outcome
+from sfm_audit.audit.normality.shapiro import shapiro_wilk, thin_observations
 
 __all__ = [
     "NormalityTests",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from audit.normality.distances import (
+from sfm_audit.audit.normality.distances import (
     half_squares_sorted,
     ks_fitted_sorted,
     ks_norm,
@@ -15,10 +15,10 @@ from audit.normality.distances import (
     ks_norm_unscaled_sorted,
     ks_sorted,
 )
-from audit.normality.moments import dagostino_pearson_from_shape, sample_shape
-from audit.normality.samples import is_finite_sample
-from audit.normality.shapiro import MAX_VALUES, shapiro_wilk_sorted, thin_observations
-from loaders.arrays import FloatArray
+from sfm_audit.audit.normality.moments import dagostino_pearson_from_shape, sample_shape
+from sfm_audit.audit.normality.samples import is_finite_sample
+from sfm_audit.audit.normality.shapiro import MAX_VALUES, shapiro_wilk_sorted, thin_observations
+from sfm_audit.loaders.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ import math
 import numpy as np
 from scipy import special
 
-from audit.normality.kolmogorov import kolmogorov_p, uniform_distance
-from audit.normality.null_tables import NullTable, modified_exponential, modified_normal, null_p
-from audit.normality.outcome import NOT_RUN, Outcome
-from audit.normality.samples import in_safe_range, is_finite_sample
-from loaders.arrays import FloatArray
+from sfm_audit.audit.normality.kolmogorov import kolmogorov_p, uniform_distance
+from sfm_audit.audit.normality.null_tables import NullTable, modified_exponential, modified_normal, null_p
+from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
+from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
+from sfm_audit.loaders.arrays import FloatArray
 
 MIN_VALUES_FITTED = 3
 MIN_POINTS_NORM = 2

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import special
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 # Where the two-sided p is below this, it is taken from the exact one-sided sum, which keeps its relative accuracy.
 TAIL_P = 0.05

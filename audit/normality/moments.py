@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from audit.normality.outcome import NOT_RUN, Outcome
-from audit.normality.samples import in_safe_range, is_finite_sample
-from loaders.arrays import FloatArray
+from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
+from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
+from sfm_audit.loaders.arrays import FloatArray
 
 MIN_VALUES_DAGOSTINO = 8
 

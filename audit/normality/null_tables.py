@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 # Beyond the last entry log p goes on as in the table between this p and the last.
 SLOPE_FROM_P = 1e-3
@@ -84,7 +84,7 @@ def null_p(table: NullTable, statistic: float, num_values: int) -> float:
 @cache
 def load(table: NullTable) -> QuantileTable:
     """Read a packaged table. After the comments: p of each column, then N and its quantiles."""
-    text = (resources.files("audit.normality") / f"{table.value}.csv").read_text(encoding="ascii")
+    text = (resources.files("sfm_audit.audit.normality") / f"{table.value}.csv").read_text(encoding="ascii")
     body = np.loadtxt(io.StringIO(text), delimiter=",", dtype=np.float64, comments="#")
     return QuantileTable(num_values=body[1:, 0], p=body[0, 1:], quantile=body[1:, 1:])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 # Fourth powers of magnitudes between these, and sums of up to 1e8 of them, stay inside float64.
 SAFE_MAGNITUDE = (1e-70, 1e70)

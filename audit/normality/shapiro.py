@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import special
 
-from audit.normality.outcome import NOT_RUN, Outcome
-from audit.normality.samples import in_safe_range, is_finite_sample
-from loaders.arrays import FloatArray
+from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
+from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
+from sfm_audit.loaders.arrays import FloatArray
 
 # Royston's fits hold for 3 <= N <= 5000.
 MIN_VALUES = 3

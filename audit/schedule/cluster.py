@@ -16,8 +16,8 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 from threadpoolctl import threadpool_limits
 
-from audit.schedule.errors import ClusterError
-from audit.schedule.task import AuditFunction, Outcome, Task, died_twice
+from sfm_audit.audit.schedule.errors import ClusterError
+from sfm_audit.audit.schedule.task import AuditFunction, Outcome, Task, died_twice
 
 LOCAL: Final = "local"
 _LOOPBACK: Final = "127.0.0.1"

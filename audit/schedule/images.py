@@ -20,8 +20,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
-from audit.engine import ModelAuditor, Spread, in_turn
-from audit.schedule.lanes import Died, Lanes, ProcessDiedError
+from sfm_audit.audit.engine.model import ModelAuditor, Spread, in_turn
+from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
 
 _ALIGNMENT: Final = 64
 _SMALL_BYTES: Final = 4096  # arrays below that are pickled with their owners

@@ -7,8 +7,8 @@ from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Final
 
-from audit.schedule.lanes import Died, Lanes, ProcessDiedError
-from audit.schedule.task import AuditFunction, Outcome, Task, died_twice
+from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
+from sfm_audit.audit.schedule.task import AuditFunction, Outcome, Task, died_twice
 
 BYTES_WORTH_A_PROCESS: Final = 50_000_000  # of input: two seconds of work; a process costs one
 # Spreading one model costs more: what its images share is written and mapped. 110 MB take 5.0 s whole, 5.6 s in two.

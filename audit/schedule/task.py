@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from audit.config import AuditConfig
-from audit.engine import audit_model
-from audit.schedule.images import image_processes
-from audit.table import ModelLabels
-from loaders import LoadError, MalformedFileError, MissingFileError, ModelRef, SparseModel, open_model
-from loaders.arrays import FloatArray
-from loaders.colmap_database import find_database, read_keypoint_shapes
-from loaders.input_state import InputState, read_input_state
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.model import audit_model
+from sfm_audit.audit.schedule.images import image_processes
+from sfm_audit.audit.table import ModelLabels
+from sfm_audit.loaders import LoadError, MalformedFileError, MissingFileError, ModelRef, SparseModel, open_model
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,12 +11,19 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.defects import DefectKind, perturbed_pose
-from audit.simulate.scene import SimulatedScene
-from audit.simulate.truth import cam_from_world, project_claimed
-from loaders.arrays import FloatArray
-from loaders.model import CameraTable, ImageTable, ObservationTable, PointTable, SparseModel, rotation_from_quat
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.defects import DefectKind, perturbed_pose
+from sfm_audit.audit.simulate.scene import SimulatedScene
+from sfm_audit.audit.simulate.truth import cam_from_world, project_claimed
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import (
+    CameraTable,
+    ImageTable,
+    ObservationTable,
+    PointTable,
+    SparseModel,
+    rotation_from_quat,
+)
 
 _GRADIENT_TOLERANCE: Final = 1e-4  # of the cost in px^2 per unit of each parameter: pose offsets end below 1e-5 px
 _MAX_ITERATIONS: Final = 200

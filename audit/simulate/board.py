@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.coverage import coverage
-from audit.simulate.lidar_scan import LidarSpec, scan
-from loaders.arrays import FloatArray, UInt8Array
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.camera_quality.coverage import coverage
+from sfm_audit.audit.simulate.lidar_scan import LidarSpec, scan
+from sfm_audit.loaders.arrays import FloatArray, UInt8Array
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 BORDER_PX: Final = 8.0  # corners stay that far inside
 _HALF_WIDTH: Final = 0.5  # of the corners' square: the unit of the world is its width
@@ -134,7 +134,7 @@ def iterate_boards(spec: BoardSpec, seed: int, *, rendered: bool) -> Iterator[tu
     """Simulate the sets of `board_sets` one by one, each with its photograph (height, width), None if not rendered."""
     camera, xyz_world = spec.camera, spec.xyz_world
     if rendered:
-        from audit.simulate.render import BoardPainter, detect_corners  # noqa: PLC0415 - needs OpenCV
+        from sfm_audit.audit.simulate.render import BoardPainter, detect_corners  # noqa: PLC0415 - needs OpenCV
 
         painter = BoardPainter.of(camera, spec.num_corners)
     for i, extent in enumerate(np.linspace(spec.min_extent, spec.max_extent, spec.num_sets)):

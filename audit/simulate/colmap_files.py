@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from loaders.arrays import IntArray
-from loaders.model import SparseModel
+from sfm_audit.loaders.arrays import IntArray
+from sfm_audit.loaders.model import SparseModel
 
 _POINT2D: Final = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
 _POINT3D: Final = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])

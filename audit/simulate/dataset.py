@@ -15,15 +15,15 @@ from typing import Final, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project_with_jacobians
-from audit.residuals import model_residuals
-from audit.simulate.adjust import Claim, sparse_model, true_claim, write_model
-from audit.simulate.defects import DefectKind, DefectSpec, perturbed_pose
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
-from audit.stationarity import pose_jacobian
-from audit.tracks import inverse_information, sum_by_point, symmetric_times
-from loaders.arrays import FloatArray
+from sfm_audit.audit.cameras import project_with_jacobians
+from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.inliers.stationarity import pose_jacobian
+from sfm_audit.audit.noise.tracks import inverse_information, sum_by_point, symmetric_times
+from sfm_audit.audit.simulate.adjust import Claim, sparse_model, true_claim, write_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec, perturbed_pose
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
+from sfm_audit.loaders.arrays import FloatArray
 
 _TRACK_DECAY: Final = 0.70  # mean track length 5
 _MIN_IMAGES: Final = 8

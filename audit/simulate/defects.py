@@ -15,11 +15,11 @@ from typing import Final, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project, project_with_jacobians
-from audit.simulate.truth import TRUE_PARAM, TrueCameras, claimed_params_of, project_true, rays_of_pixels
-from audit.stationarity import pose_jacobian
-from loaders.arrays import FloatArray
-from loaders.camera_models import CameraModel
+from sfm_audit.audit.cameras import project, project_with_jacobians
+from sfm_audit.audit.inliers.stationarity import pose_jacobian
+from sfm_audit.audit.simulate.truth import TRUE_PARAM, TrueCameras, claimed_params_of, project_true, rays_of_pixels
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
 
 
 class DefectKind(StrEnum):

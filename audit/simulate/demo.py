@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, SimulatedScene
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, SimulatedScene
 
 _NUM_IMAGES: Final = 40
 _POINTS_PER_IMAGE: Final = 350

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.truth import TrueCameras, cam_from_world, project_true, rays_of_pixels
-from loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.simulate.truth import TrueCameras, cam_from_world, project_true, rays_of_pixels
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _MAX_STOREYS: Final = 5
 _POSITION_JITTER: Final = 0.3  # model units, uniform in +- that, along x and y; 1.5 times along z

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

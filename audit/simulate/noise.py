@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.optimize import brentq
 
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _T5_SD = math.sqrt(5.0 / 3.0)  # of Student's t with five degrees of freedom
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from audit.simulate.defects import (
+from sfm_audit.audit.simulate.defects import (
     CORNERS,
     DefectKind,
     DefectSpec,
@@ -20,10 +20,10 @@ from audit.simulate.defects import (
     with_defect,
     words_of,
 )
-from audit.simulate.layout import Tracks
-from audit.simulate.truth import TrueCameras, project_true
-from loaders.arrays import BoolArray, FloatArray
-from loaders.camera_models import CameraModel
+from sfm_audit.audit.simulate.layout import Tracks
+from sfm_audit.audit.simulate.truth import TrueCameras, project_true
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
 
 _CORNER_SHARE: Final = 0.35  # of width and of height: the corner in which FEW_POINTS leaves points
 _SETTLING_ROUNDS: Final = 8

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import erf, ndtr
 
-from audit.calibrate.camera import CalibratedCamera
-from audit.simulate.board import BoardPose
-from loaders.arrays import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
+from sfm_audit.audit.simulate.board import BoardPose
+from sfm_audit.loaders.arrays import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 
 _KNOT_PX: Final = 16.0  # of the spline through the rays of pixels: exact to 1e-7
 _REACH_SD: Final = 5.0  # of the blur: further from an edge a pixel sees one side only

@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.simulate.lidar_scan import LidarSpec, scan
-from loaders.arrays import FloatArray
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.simulate.lidar_scan import LidarSpec, scan
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 _ESTIMATED: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "k3")
 

@@ -7,11 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from audit.simulate.defects import DefectSpec, PlantedDefect
-from audit.simulate.layout import TrackLaw, draw_tracks, place_cameras
-from audit.simulate.noise import NoiseSpec, draw_noise
-from audit.simulate.planting import plant, planted_defects, settle
-from audit.simulate.truth import (
+from sfm_audit.audit.simulate.defects import DefectSpec, PlantedDefect
+from sfm_audit.audit.simulate.layout import TrackLaw, draw_tracks, place_cameras
+from sfm_audit.audit.simulate.noise import NoiseSpec, draw_noise
+from sfm_audit.audit.simulate.planting import plant, planted_defects, settle
+from sfm_audit.audit.simulate.truth import (
     NUM_TRUE_PARAMS,
     TRUE_PARAM,
     TrueCameras,
@@ -19,8 +19,8 @@ from audit.simulate.truth import (
     project_true,
     true_model_of,
 )
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.camera_models import BY_NAME, CameraModel
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.camera_models import BY_NAME, CameraModel
 
 _MIN_BORDER_PX: Final = 10.0
 

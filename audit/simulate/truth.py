@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project, unproject
-from loaders.arrays import FloatArray, IntArray
-from loaders.camera_models import BY_NAME, CameraModel
+from sfm_audit.audit.cameras import project, unproject
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.camera_models import BY_NAME, CameraModel
 
 NUM_TRUE_PARAMS: Final = 12
 TRUE_PARAM: Final = {"fx": 0, "fy": 1, "cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7, "k3": 8, "k4": 9}

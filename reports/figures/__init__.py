@@ -6,13 +6,19 @@ were. Needs the extra ``report``.
 
 from __future__ import annotations
 
-from reports.figures.cameras import expected_error, misfit_groups
-from reports.figures.captions import CAPTIONS
-from reports.figures.normality import qq_plot, scale_comparison, standardised_histogram
-from reports.figures.residuals import ResidualError, Residuals, read_residuals
-from reports.figures.runs import RunColumns, histogram_by_verdict, ks_comparison, noise_comparison, verdict_bars
-from reports.figures.sensor import inliers_on_photo, radial_profile, residual_field, residual_vectors
-from reports.figures.style import VERDICT_COLOURS
+from sfm_audit.reports.figures.cameras import expected_error, misfit_groups
+from sfm_audit.reports.figures.captions import CAPTIONS
+from sfm_audit.reports.figures.normality import qq_plot, scale_comparison, standardised_histogram
+from sfm_audit.reports.figures.residuals import ResidualError, Residuals, read_residuals
+from sfm_audit.reports.figures.runs import (
+    RunColumns,
+    histogram_by_verdict,
+    ks_comparison,
+    noise_comparison,
+    verdict_bars,
+)
+from sfm_audit.reports.figures.sensor import inliers_on_photo, radial_profile, residual_field, residual_vectors
+from sfm_audit.reports.figures.style import VERDICT_COLOURS
 
 __all__ = [
     "CAPTIONS",

@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from loaders.arrays import FloatArray
-from reports.figures.style import (
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.figures.style import (
     BLUE,
     COLOUR_BAR,
     INK,

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import special
 
-from loaders.arrays import FloatArray, IntArray
-from reports.figures.residuals import Residuals
-from reports.figures.style import BLUE, INK, MUTED, VERMILION, new_axes, say_nothing_to_show, styled
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.reports.figures.residuals import Residuals
+from sfm_audit.reports.figures.style import BLUE, INK, MUTED, VERMILION, new_axes, say_nothing_to_show, styled
 
 _REACH: Final = 5.0  # sd shown; what lies beyond is counted in the outermost bars
 _BINS: Final = 41

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
-from loaders.arrays import FloatArray
-from loaders.camera_models import BY_NAME
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import BY_NAME
 
 _MAD_OF_NORMAL: Final = 0.6744897501960817
 _XY: Final = ("x_px", "y_px")

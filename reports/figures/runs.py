@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
-from loaders.arrays import FloatArray
-from reports.figures.style import (
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.figures.style import (
     BLUE,
     INK,
     MUTED,

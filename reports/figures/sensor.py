@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from loaders.arrays import FloatArray, IntArray
-from reports.figures.residuals import Residuals
-from reports.figures.style import (
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.reports.figures.residuals import Residuals
+from sfm_audit.reports.figures.style import (
     BLUE,
     COLOUR_BAR,
     MUTED,

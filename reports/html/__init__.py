@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from reports.html.content import MAX_ROWS, RunContent, read_content
-from reports.html.page import PageInput, render_page
-from reports.html.pictures import ImagePictures, Picture, draw_image
+from sfm_audit.reports.html.content import MAX_ROWS, RunContent, read_content
+from sfm_audit.reports.html.page import PageInput, render_page
+from sfm_audit.reports.html.pictures import ImagePictures, Picture, draw_image
 
 __all__ = [
     "MAX_ROWS",

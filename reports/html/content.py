@@ -12,12 +12,12 @@ from typing import Any, Final
 import numpy as np
 import pyarrow.parquet as pq
 
-from audit.table import TABLES
-from loaders.arrays import FloatArray
-from reports.explain import split_reason
-from reports.reader import Row, RunReader
-from reports.reasons import is_remark
-from reports.wording import natural_key
+from sfm_audit.audit.table import TABLES
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.run_folder.reader import Row, RunReader
+from sfm_audit.reports.text.explain import split_reason
+from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.reports.text.wording import natural_key
 
 MAX_ROWS: Final = 10_000  # of the image table
 MAX_SCENES: Final = 300

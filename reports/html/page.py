@@ -12,15 +12,15 @@ from typing import Any, Final
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from audit.table import TABLES
-from loaders.camera_models import BY_NAME
-from reports import figures
-from reports.explain import LIMITS, QUESTIONS, plain_reason, split_reason
-from reports.html.content import MAX_CAMERAS, MAX_SCENES, MEMBERS, POLICIES, VERDICTS, Reason, RunContent
-from reports.html.pictures import ImagePictures, Picture
-from reports.html.svg import to_svg
-from reports.reader import Row
-from reports.wording import counted, number, plain, px
+from sfm_audit.audit.table import TABLES
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.reports import figures
+from sfm_audit.reports.html.content import MAX_CAMERAS, MAX_SCENES, MEMBERS, POLICIES, VERDICTS, Reason, RunContent
+from sfm_audit.reports.html.pictures import ImagePictures, Picture
+from sfm_audit.reports.html.svg import to_svg
+from sfm_audit.reports.run_folder.reader import Row
+from sfm_audit.reports.text.explain import LIMITS, QUESTIONS, plain_reason, split_reason
+from sfm_audit.reports.text.wording import counted, number, plain, px
 
 _PANEL_ONLY: Final = (
     *("scene", "component", "model_path", "image_id", "camera_id", "camera_model", "width", "height"),

@@ -9,9 +9,9 @@ from typing import Any
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from reports import figures
-from reports.figures import CAPTIONS
-from reports.html.svg import to_jpeg_url, to_svg
+from sfm_audit.reports import figures
+from sfm_audit.reports.figures import CAPTIONS
+from sfm_audit.reports.html.svg import to_jpeg_url, to_svg
 
 
 @dataclass(frozen=True, slots=True)

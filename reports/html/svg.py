@@ -11,7 +11,7 @@ import matplotlib as mpl
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from reports.figures import style
+from sfm_audit.reports.figures import style
 
 _VARIABLES: Final = {
     style.BLUE: "--blue",

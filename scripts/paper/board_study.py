@@ -8,14 +8,14 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from audit.calibrate.estimate import Estimate
-from audit.calibrate.estimators import estimator
-from audit.calibrate.validation import validate
-from audit.misfit import GROUPS, MisfitTests, candidate_fields, prepare
-from audit.multiplicity import holm
-from audit.simulate.board import BoardSet, BoardSpec, board_sets
 from scripts.paper.judging import judged
 from scripts.paper.rates import ALPHA, thirds_of
+from sfm_audit.audit.calibrate.estimate import Estimate
+from sfm_audit.audit.calibrate.estimators import estimator
+from sfm_audit.audit.calibrate.validation import validate
+from sfm_audit.audit.misfit import GROUPS, MisfitTests, candidate_fields, prepare
+from sfm_audit.audit.misfit.multiplicity import holm
+from sfm_audit.audit.simulate.board import BoardSet, BoardSpec, board_sets
 
 WRONG, RIGHT = "D1", "D3"
 MODELS: Final = (WRONG, RIGHT)

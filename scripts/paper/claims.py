@@ -9,11 +9,11 @@ from typing import Final
 
 import pandas as pd
 
-from audit.misfit import GROUPS
 from scripts.paper.board_study import RENDERED, RIGHT, WRONG
 from scripts.paper.motivating import TAIL
 from scripts.paper.rates import ALPHA, SCALES, TESTS, THIRDS, chosen, rates_by_third, rejects
 from scripts.validation.study import VIOLATED, Check
+from sfm_audit.audit.misfit import GROUPS
 
 Tables = dict[str, pd.DataFrame]
 MOSTLY: Final = 0.5  # a test that finds fewer does not separate

@@ -12,13 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-from loaders.arrays import FloatArray
-from reports.figures.style import AMBER, BLUE, GRID, INK, MUTED, VERMILION, styled
 from scripts.paper.board_study import RENDERED, RIGHT, WRONG
 from scripts.paper.claims import Tables, of_model
 from scripts.paper.megadepth import EDGES, NOISES, histogram_columns
 from scripts.paper.motivating import CLAIMED, TAIL, sample, scale_of
 from scripts.paper.rates import ALPHA, chosen, rates_by_third
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.figures.style import AMBER, BLUE, GRID, INK, MUTED, VERMILION, styled
 
 WIDTH: Final = 7.2
 FLOOR: Final = 1e-6  # smaller p-values are drawn there

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from audit.calibrate.estimate import DegenerateInputError, Estimator
-from audit.calibrate.lidar import lidar_predictors
-from audit.calibrate.validation import Validation, validate
-from audit.misfit import GROUPS, MisfitStatus
-from audit.noise_variants import fit_variance_literal
-from audit.normality import ks
-from loaders.correspondences import Correspondences
 from scripts.paper.rates import SCALES, TESTS
+from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimator
+from sfm_audit.audit.calibrate.lidar import lidar_predictors
+from sfm_audit.audit.calibrate.validation import Validation, validate
+from sfm_audit.audit.misfit import GROUPS, MisfitStatus
+from sfm_audit.audit.noise.variants import fit_variance_literal
+from sfm_audit.audit.normality import ks
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 Row = dict[str, object]
 

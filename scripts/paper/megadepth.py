@@ -10,13 +10,13 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from audit import ModelAuditor
-from audit.noise import fit_constant_variance
-from audit.normality import normality_tests
-from audit.standardise import constant_noise, track_noise
-from loaders import open_model
-from loaders.discover import discover
 from scripts.paper.rates import olsson_accepts
+from sfm_audit.audit import ModelAuditor
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.noise.standardise import constant_noise, track_noise
+from sfm_audit.audit.normality import normality_tests
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.datasets.discover import discover
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 EDGES: Final = np.linspace(-5.0, 5.0, 41)  # of the densities of z; what lies beyond counts in the outermost bins

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from audit.noise import fit_constant_variance
-from audit.normality import dagostino_pearson, ks, shapiro_wilk
-from loaders.arrays import FloatArray
 from scripts.paper.rates import ALPHA, olsson_accepts
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.normality import dagostino_pearson, ks, shapiro_wilk
+from sfm_audit.loaders.arrays import FloatArray
 
 SIZES: Final = (100, 225, 1000)
 SIGMAS: Final = (0.02, 0.05, 0.1, 0.2)

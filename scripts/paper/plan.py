@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from audit.simulate.board import BoardSpec
 from scripts.paper.board_study import POINTS, RENDERED, BoardDesign, board_rows, protection_rows
 from scripts.paper.megadepth import megadepth_folder, megadepth_images, model_locations
 from scripts.paper.motivating import SIGMAS, SIZES, motivating_trials
 from scripts.paper.tables import CAMERAS, room_rows, zhang_rows
 from scripts.validation.study import Task
+from sfm_audit.audit.simulate.board import BoardSpec
 
 BOARD_SEEDS = 8
 _QUICK_SCENE = "9003"

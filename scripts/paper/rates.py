@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 ALPHA: Final = 0.05
 THIRDS: Final = ("low", "mid", "high")

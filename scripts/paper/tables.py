@@ -7,13 +7,13 @@ from typing import Final, get_args
 import numpy as np
 import pandas as pd
 
-from audit.calibrate.estimators import estimator
-from audit.calibrate.zhang import ZhangModel, zhang
-from audit.normality import normality_tests
-from audit.simulate.room import RoomSpec, room_sets, zhang_views
-from audit.standardise import constant_noise
 from scripts.paper.judging import judged
 from scripts.paper.rates import TESTS
+from sfm_audit.audit.calibrate.estimators import estimator
+from sfm_audit.audit.calibrate.zhang import ZhangModel, zhang
+from sfm_audit.audit.noise.standardise import constant_noise
+from sfm_audit.audit.normality import normality_tests
+from sfm_audit.audit.simulate.room import RoomSpec, room_sets, zhang_views
 
 CAMERAS: Final = ("plain", "wide")  # stand for axisp3364 and axis223m
 ROOM_MODELS: Final = ("D1", "D3", "pnprf")

@@ -11,15 +11,15 @@ import numpy as np
 import pandas as pd
 import pycolmap
 
-from audit.config import AuditConfig
-from audit.engine import ModelAuditor
-from audit.misfit import extended_camera
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.scene import SimulatedScene
-from loaders import open_model
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord, CameraTable, SparseModel
 from scripts.validation.scenes import Design, simulate
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.misfit import extended_camera
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.scene import SimulatedScene
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, CameraTable, SparseModel
 
 _MAX_ITERATIONS = 200
 _FUNCTION_TOLERANCE = 1e-10

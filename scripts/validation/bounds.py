@@ -8,12 +8,12 @@ from typing import Final
 
 import pandas as pd
 
-from audit.misfit import GROUPS
-from audit.simulate.defects import DefectKind
-from audit.simulate.noise import NoiseKind
 from scripts.validation.singles import EXACT_DEFECTS
 from scripts.validation.study import HOLDS, VIOLATED, Check, check
 from scripts.validation.truth import ALPHA, ANSWERS, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.simulate.defects import DefectKind
+from sfm_audit.audit.simulate.noise import NoiseKind
 
 Tables = dict[str, pd.DataFrame]
 LEVEL_TESTS: Final = ("ks_fitted", "dap", "sw")

@@ -10,11 +10,11 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from audit.misfit import GROUPS
-from audit.simulate.noise import NoiseKind
 from scripts.validation.bounds import Tables, cells, tested_share
 from scripts.validation.rules import SCORES, curve, rules
 from scripts.validation.truth import CAMERA_DEFECTS, SOUND, TAU_PX
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.simulate.noise import NoiseKind
 
 _COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _MARKERS: Final = ("o", "s", "^", "v", "D", "P", "X")

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from audit.misfit import GROUPS
-from audit.simulate.defects import DefectKind
 from scripts.validation import words
 from scripts.validation.bounds import Tables, Within, cells, effect_ratio, tested_share
 from scripts.validation.rules import rule_rows
 from scripts.validation.study import HOLDS, VIOLATED, WITHIN_CHANCE, Check
 from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, TAU_PX, is_right
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.simulate.defects import DefectKind
 
 CLASSES: Final = ((0.2, 0.3), (0.3, 0.5), (0.5, np.inf))
 POWER_CLASSES: Final = ((0.03, 0.1), (0.1, 0.2), (0.2, 0.3), (0.3, 0.5), (0.5, 1.2))

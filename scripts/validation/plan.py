@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from audit.simulate.noise import NoiseKind
-from audit.simulate.scene import SceneSpec
 from scripts.validation.advice import advise_one, advise_shared
 from scripts.validation.scenes import Design, audit_images, audit_shared_camera
 from scripts.validation.singles import EXACT_DEFECTS, exact_trials, power_trials, size_trials
 from scripts.validation.study import Task
 from scripts.validation.truth import CAMERA_DEFECTS, NOISES, SIZES
+from sfm_audit.audit.simulate.noise import NoiseKind
+from sfm_audit.audit.simulate.scene import SceneSpec
 
 BOUNDED_NOISES = (NoiseKind.GAUSSIAN, NoiseKind.PER_TRACK_LOGNORMAL)
 SHARED_K2 = (0.005, 0.01, 0.02, 0.05)

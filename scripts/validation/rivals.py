@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from audit.engine import ModelAuditor
-from loaders.arrays import FloatArray
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.loaders.arrays import FloatArray
 
 _BINS: Final = 8  # per axis, over +- _HALF_EXTENT standard deviations
 _HALF_EXTENT: Final = 2.5

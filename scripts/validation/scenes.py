@@ -7,16 +7,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from audit.config import AuditConfig
-from audit.engine import ModelAuditor
-from audit.misfit import GROUPS
-from audit.simulate.adjust import AdjustmentError, adjust_scene, sparse_model
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseKind
-from audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
-from loaders.model import SparseModel
 from scripts.validation.rivals import rival_columns
 from scripts.validation.truth import CAMERA_DEFECTS, SOUND, noise_of
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.simulate.adjust import AdjustmentError, adjust_scene, sparse_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseKind
+from sfm_audit.audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
+from sfm_audit.loaders.model import SparseModel
 
 IMAGES_PER_SCENE = 40
 _ATTEMPTS = 3

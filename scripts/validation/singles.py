@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from audit.cameras import project, project_with_jacobians, unproject
-from audit.config import AuditConfig
-from audit.image_audit import ImageAudit, audit_inliers
-from audit.misfit import GROUPS
-from audit.simulate.defects import (
+from scripts.validation.truth import SIGMA_PX, noise_of
+from sfm_audit.audit.cameras import project, project_with_jacobians, unproject
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
+from sfm_audit.audit.inliers.stationarity import pose_jacobian
+from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.simulate.defects import (
     DefectKind,
     defect_size_px,
     perturbed_pose,
@@ -17,13 +19,11 @@ from audit.simulate.defects import (
     values_of_size,
     with_defect,
 )
-from audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
-from audit.simulate.truth import TrueCameras, claimed_params_of, project_true, true_model_of
-from audit.stationarity import pose_jacobian
-from loaders.arrays import FloatArray
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord, ImageRecord, InlierSet
-from scripts.validation.truth import SIGMA_PX, noise_of
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
+from sfm_audit.audit.simulate.truth import TrueCameras, claimed_params_of, project_true, true_model_of
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet
 
 WIDTH, HEIGHT, FOCAL, K1 = 1600, 1200, 1000.0, -0.05
 DEPTHS = (4.0, 10.0)

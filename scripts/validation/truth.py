@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from audit.misfit import MisfitGroup
-from audit.simulate.defects import DefectKind
-from audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.misfit import MisfitGroup
+from sfm_audit.audit.simulate.defects import DefectKind
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
 
 SIGMA_PX: Final = 0.5
 ALPHA: Final = 0.05

@@ -5,8 +5,8 @@ import time
 import pytest
 from report_samples import NASTY_NAMES, browser, needs_chromium, read_sample, screenshot_folder
 
-from reports import html
-from reports.wording import plain
+from sfm_audit.reports import html
+from sfm_audit.reports.text.wording import plain
 
 pytestmark = needs_chromium
 SECONDS_TO_OPEN = 3.0

@@ -9,7 +9,7 @@ import pytest
 from calibrate_samples import FOCAL, FORWARD, LENS, board, room, with_outliers
 from scipy import stats
 
-from audit.calibrate.estimators import ESTIMATORS
+from sfm_audit.audit.calibrate.estimators import ESTIMATORS
 
 
 def focal_errors(name, make, num_scenes, seed):

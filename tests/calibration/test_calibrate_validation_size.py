@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from audit.calibrate.estimators import estimator
-from audit.calibrate.validation import validate
-from audit.misfit import GROUPS, MisfitStatus
-from audit.simulate.board import BoardSpec, board_sets
-from audit.verdict import Verdict
+from sfm_audit.audit.calibrate.estimators import estimator
+from sfm_audit.audit.calibrate.validation import validate
+from sfm_audit.audit.decision.verdict import Verdict
+from sfm_audit.audit.misfit import GROUPS, MisfitStatus
+from sfm_audit.audit.simulate.board import BoardSpec, board_sets
 
 SETS = 28
 SEEDS = range(4)

@@ -7,9 +7,9 @@ import pytest
 from misfit_reference import NOISE, camera, points, refit, residuals_of
 from scipy import stats
 
-from audit.cameras import project
-from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, camera_tests, image_design, prepare_image
-from audit.simulate.defects import systematic_rms_px
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.misfit import GROUPS, MisfitGroup, MisfitStatus, camera_tests, image_design, prepare_image
+from sfm_audit.audit.simulate.defects import systematic_rms_px
 
 TRIALS = 400
 SIGMA_PX = 0.5

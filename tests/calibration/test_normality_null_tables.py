@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from audit.normality import null_tables
-from audit.normality.null_tables import NullTable, QuantileTable, load
+from sfm_audit.audit.normality import null_tables
+from sfm_audit.audit.normality.null_tables import NullTable, QuantileTable, load
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_null_tables.py"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from audit import normality
+from sfm_audit.audit import normality
 
 TRIALS = 2000
 TESTS = ("ks", "ks_fitted", "ks_norm", "ks_norm_unscaled", "dap", "sw")

@@ -9,10 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from audit.simulate.board import BoardSpec
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.noise import NoiseKind
-from audit.simulate.scene import SceneSpec
 from scripts.paper import claims
 from scripts.paper.board_study import POINTS, RENDERED, RIGHT, WRONG, BoardDesign, board_rows, protection_rows
 from scripts.paper.claims import Word, judge_claims, misfit_checks, of_model, upper_thirds, word_of
@@ -24,6 +20,10 @@ from scripts.paper.rates import THIRDS, olsson_accepts, rejects, thirds_of
 from scripts.paper.tables import room_rows, zhang_rows
 from scripts.validation.scenes import Design, simulate
 from scripts.validation.study import HOLDS, VIOLATED, Task, run_tasks
+from sfm_audit.audit.simulate.board import BoardSpec
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.noise import NoiseKind
+from sfm_audit.audit.simulate.scene import SceneSpec
 
 FEW = BoardDesign(POINTS, BoardSpec(num_sets=9))
 RENDERED_FEW = BoardDesign(RENDERED, BoardSpec(num_sets=3))

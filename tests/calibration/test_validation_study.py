@@ -10,10 +10,6 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from audit.residuals import model_residuals
-from audit.simulate.defects import DefectKind
-from audit.simulate.noise import NoiseKind
-from audit.simulate.scene import SceneSpec
 from scripts.validation.advice import advise_one, refine, with_models
 from scripts.validation.bounds import all_checks
 from scripts.validation.page import document
@@ -22,6 +18,10 @@ from scripts.validation.rules import best_threshold
 from scripts.validation.scenes import Design, audit_images, audit_shared_camera, simulate
 from scripts.validation.singles import audit_points, draw_points, exact_trials, power_trials, size_trials
 from scripts.validation.study import HOLDS, VIOLATED, WITHIN_CHANCE, Check, Task, run_tasks
+from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.simulate.defects import DefectKind
+from sfm_audit.audit.simulate.noise import NoiseKind
+from sfm_audit.audit.simulate.scene import SceneSpec
 
 SMALL = SceneSpec(num_images=20)
 TINY = [

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from calibrate_doubles import board, true_camera
 
-from audit.cli.main import main
-from audit.table import CALIBRATION, CALIBRATION_RESIDUALS
-from reports.reasons import is_remark
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.table import CALIBRATION, CALIBRATION_RESIDUALS
+from sfm_audit.reports.text.reasons import is_remark
 
 PNG = b"\x89PNG"
 FIGURES = (
@@ -114,7 +114,11 @@ def test_neighbours_bring_the_lidar_noise(capsys):
 
 def test_without_the_extra_one_line_says_so(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "poselib", None)
-    for name in [name for name in sys.modules if name.startswith(("audit.calibrate", "audit.cli.calibration"))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith(("sfm_audit.audit.calibrate", "sfm_audit.audit.cli.calibration"))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     assert main(["calibrate", "board.csv"]) == 2
     assert 'poselib is not installed; it belongs to the extra "calibrate"' in capsys.readouterr().err

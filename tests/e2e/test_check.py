@@ -9,7 +9,7 @@ import pytest
 from gate_samples import but, rejected, scene, without, write_run
 from rich.cells import cell_len
 
-from audit.cli.main import main
+from sfm_audit.audit.cli.main import main
 
 SOUND = {"a": scene(40), "b": scene(40)}
 

@@ -12,7 +12,7 @@ import pytest
 from process_tree import descendants, is_worker
 from run_samples import read_run, run_cli, start_cli, wait_for, write_models
 
-from audit.cli.main import main
+from sfm_audit.audit.cli.main import main
 
 pytest.importorskip("distributed")
 
@@ -82,7 +82,7 @@ def test_a_model_that_kills_its_worker_is_a_failure_and_the_others_are_not():
 
 @pytest.mark.usefixtures("data")
 def test_no_scheduler_is_2(monkeypatch, capsys):
-    monkeypatch.setattr("audit.schedule.cluster._CONNECT_SECONDS", 1)
+    monkeypatch.setattr("sfm_audit.audit.schedule.cluster._CONNECT_SECONDS", 1)
     for address in (f"tcp://127.0.0.1:{free_port()}", "nonsense"):
         assert main(["run", "data", "-o", "RUN", "--dask", address]) == 2
         err = capsys.readouterr().err

@@ -5,9 +5,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from audit.cli.demo import NOT_REGISTERED, _compared, _why_not_found
-from audit.cli.main import main
-from audit.simulate.demo import TruthRecord
+from sfm_audit.audit.cli.demo import NOT_REGISTERED, _compared, _why_not_found
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.demo import TruthRecord
 
 
 @pytest.fixture(scope="module")
@@ -17,8 +17,8 @@ def demo(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         printed: list[str] = []
-        patch.setattr("audit.cli.auditing.print_page", printed.append)
-        patch.setattr("audit.cli.demo.print_page", printed.append)
+        patch.setattr("sfm_audit.audit.cli.auditing.print_page", printed.append)
+        patch.setattr("sfm_audit.audit.cli.demo.print_page", printed.append)
         assert main(["demo"]) == 0
     return folder / "audit-demo", "\n".join(printed)
 

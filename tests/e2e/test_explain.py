@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from run_samples import write_models
 
-from audit.cli.main import main
-from audit.simulate.adjust import write_adjusted_model
-from audit.simulate.defects import DefectKind
-from audit.simulate.demo import demo_scene, truth_records
-from audit.simulate.scene import simulate_scene
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.adjust import write_adjusted_model
+from sfm_audit.audit.simulate.defects import DefectKind
+from sfm_audit.audit.simulate.demo import demo_scene, truth_records
+from sfm_audit.audit.simulate.scene import simulate_scene
 
 PNG = b"\x89PNG"
 

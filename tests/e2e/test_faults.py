@@ -18,8 +18,8 @@ from audit_stubs import SECONDS
 from process_tree import descendants, is_worker
 from run_samples import copy_models, part_times, read_run, run_cli, start_cli, truncate, wait_for
 
-from audit.cli.main import main
-from audit.simulate.dataset import DatasetSpec, write_dataset
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.dataset import DatasetSpec, write_dataset
 
 KILLS = int(os.environ.get("SFM_AUDIT_FAULTS", "1"))
 NUM_SCENES = 6

@@ -11,12 +11,12 @@ import pandas as pd
 import pycolmap
 import pytest
 
-from audit.cli.main import main
-from audit.residuals import model_residuals
-from audit.simulate.adjust import write_adjusted_model
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders import open_model
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.simulate.adjust import write_adjusted_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders import open_model
 
 PLANTED = {3: DefectKind.RADIAL_K2, 8: DefectKind.TANGENTIAL, 12: DefectKind.RADIAL_K2, 17: DefectKind.PERTURBED_POSE}
 MISFITS = {3, 8, 12}
@@ -99,7 +99,7 @@ def test_keeping_everything_changes_no_number(monkeypatch):
 
 
 def accept_all(monkeypatch):
-    monkeypatch.setattr("reports.selection.AuditedImage.is_kept", lambda *_: True)
+    monkeypatch.setattr("sfm_audit.reports.export.selection.AuditedImage.is_kept", lambda *_: True)
 
 
 def write_scene_info(path: str, names) -> dict:

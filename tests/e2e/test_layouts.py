@@ -7,7 +7,7 @@ import pytest
 from corpus import needs_corpus
 from run_samples import part_times, truncate, write_models
 
-from audit.cli.main import main
+from sfm_audit.audit.cli.main import main
 
 FOLDERS = {
     "MegaDepth/0001/sparse/manhattan/0": ("0001", "0"),

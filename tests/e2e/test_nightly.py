@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from audit.cli.main import main
-from audit.simulate.adjust import write_adjusted_model
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.adjust import write_adjusted_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 NOISE = NoiseSpec(NoiseKind.PER_TRACK_LOGNORMAL, sigma_px=0.5, log_spread=0.75)
 SCENE = SceneSpec(num_images=20, points_per_image=250, noise=NOISE)

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from run_samples import part_times, write_models
 
-from audit.cli.main import main
-from reports.figures import ResidualError, read_residuals
+from sfm_audit.audit.cli.main import main
+from sfm_audit.reports.figures import ResidualError, read_residuals
 
 
 @pytest.fixture(scope="session")
@@ -168,7 +168,7 @@ def test_a_run_that_was_not_finished_is_shown_and_said():
 
 def test_a_missing_library_names_the_extra(capsys, monkeypatch):
     run()
-    monkeypatch.setitem(__import__("sys").modules, "audit.cli.report_page", None)
+    monkeypatch.setitem(__import__("sys").modules, "sfm_audit.audit.cli.report_page", None)
     assert main(["report", "RUN", "-o", "page.html"]) == 2
     assert 'pip install "sfm-audit[report]"' in capsys.readouterr().err
 

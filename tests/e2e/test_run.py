@@ -11,7 +11,7 @@ import pytest
 from audit_stubs import SECONDS
 from run_samples import copy_models, part_times, read_run, run_cli, start_cli, truncate, wait_for, write_models
 
-from audit.cli.main import main
+from sfm_audit.audit.cli.main import main
 
 pytestmark = pytest.mark.usefixtures("data")
 NAMES = ("0001", "0002", "a name with spaces", "Zürich 東")

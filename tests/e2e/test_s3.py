@@ -11,9 +11,9 @@ from model_writer import rig_model, text_files, tiny_model, write_binary, write_
 from run_samples import part_times, read_run, write_models
 from s3_server import KEYS, S3Server, free_port, s3_server
 
-from audit.cli.main import main
-from loaders import LoadError, discover, input_files, open_model
-from loaders.input_state import input_stamp, read_input_state
+from sfm_audit.audit.cli.main import main
+from sfm_audit.loaders import LoadError, discover, input_files, open_model
+from sfm_audit.loaders.datasets.input_state import input_stamp, read_input_state
 
 NAMES = ("0001", "0002", "Zürich 東", "a name with spaces")
 MODEL = "0001/sparse/manhattan/0"

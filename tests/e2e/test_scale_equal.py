@@ -3,8 +3,8 @@
 import pytest
 from run_samples import read_run, run_cli
 
-from audit.cli.main import main
-from audit.simulate.dataset import DatasetSpec, write_dataset
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.dataset import DatasetSpec, write_dataset
 
 SCHEDULES = {"processes": ("--jobs", "2"), "dask": ("--jobs", "2", "--dask", "local")}
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from audit.cli.main import main
-from audit.simulate.board import BoardSpec, board_sets
-from audit.simulate.render import DetectorError
-from audit.simulate.room import RoomSpec, room_sets
-from loaders.correspondences_table import read_correspondences
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.simulate.board import BoardSpec, board_sets
+from sfm_audit.audit.simulate.render import DetectorError
+from sfm_audit.audit.simulate.room import RoomSpec, room_sets
+from sfm_audit.loaders.correspondences.table import read_correspondences
 
 
 def truth_of(folder):
@@ -60,7 +60,7 @@ def test_rooms_and_points_only_boards(tmp_path, capsys):
 
 def test_points_only_and_rooms_need_no_opencv(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    monkeypatch.delitem(sys.modules, "audit.simulate.render")
+    monkeypatch.delitem(sys.modules, "sfm_audit.audit.simulate.render")
     assert main(["simulate", "board", "-o", str(tmp_path / "a"), "--sets", "1", "--points-only"]) == 0
     assert main(["simulate", "room", "-o", str(tmp_path / "b"), "--sets", "1"]) == 0
     assert main(["simulate", "board", "-o", str(tmp_path / "c"), "--sets", "1"]) == 2
@@ -95,7 +95,7 @@ def test_a_lost_corner_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, cap
     def lose(*_: object):
         raise DetectorError("3 of 225 corners found more than 0.5 px off (up to 0.61 px)")
 
-    monkeypatch.setattr("audit.simulate.render.detect_corners", lose)
+    monkeypatch.setattr("sfm_audit.audit.simulate.render.detect_corners", lose)
     assert main(["simulate", "board", "-o", str(tmp_path / "b"), "--sets", "2"]) == 2
     message = capsys.readouterr().err
     assert message.startswith("sfm-audit: the detector failed: 3 of 225 corners")

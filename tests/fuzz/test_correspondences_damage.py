@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from loaders import LoadError
-from loaders.correspondences_table import read_correspondences
-from loaders.scan_ptx import read_ptx
+from sfm_audit.loaders import LoadError
+from sfm_audit.loaders.correspondences.scan_ptx import read_ptx
+from sfm_audit.loaders.correspondences.table import read_correspondences
 
 CSV = b"# width=1600 height=1200 rows=3\nx,y,X,Y,Z,name\n1.5,2,3,4e1,5,a\n1.25,2.5,-3,4,5,b\n7,8,9,10,11,\n"
 PTX = b"2\n2\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n5 6 7 1\n" + b"1 2 3.25 0.5 1 2 3\n" * 4

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from model_writer import binary_files, rig_model, text_files, write_binary, write_text
 
-from loaders import FindingCode, LoadError, SparseModel, open_model
+from sfm_audit.loaders import FindingCode, LoadError, SparseModel, open_model
 
 BINARY, TEXT = binary_files(rig_model()), text_files(rig_model())
 HAND_WRITTEN = text_files(rig_model(), header=False)

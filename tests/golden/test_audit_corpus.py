@@ -9,8 +9,8 @@ import pytest
 from corpus import REFUSED_BY_PYCOLMAP, parametrize_models
 from numpy.testing import assert_allclose
 
-from audit import AuditConfig, ModelAuditor, audit_model
-from loaders import open_model
+from sfm_audit.audit import AuditConfig, ModelAuditor, audit_model
+from sfm_audit.loaders import open_model
 
 # its POINTS2D say -1 and its tracks say otherwise: pycolmap believes the tracks, an audit the images
 HAND_MADE = {"gtsfm_unsorted_txt"}

@@ -7,11 +7,11 @@ import pycolmap
 import pytest
 from numpy.testing import assert_allclose
 
-from audit import ModelAuditor, audit_model
-from audit.simulate.adjust import adjust_scene, write_model
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders import open_model
-from loaders.camera_models import CAMERA_MODELS
+from sfm_audit.audit import ModelAuditor, audit_model
+from sfm_audit.audit.simulate.adjust import adjust_scene, write_model
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.camera_models import CAMERA_MODELS
 
 IDENTITY = ["model_path", "file_format", "dataset", "scene", "component"]
 

@@ -8,8 +8,8 @@ import pytest
 from corpus import REFUSED_BY_PYCOLMAP, UNREADABLE, needs_corpus, parametrize_models
 from numpy.testing import assert_allclose, assert_array_equal
 
-from loaders import FindingCode, LoadError, SparseModel, open_model
-from loaders.camera_models import CAMERA_MODELS
+from sfm_audit.loaders import FindingCode, LoadError, SparseModel, open_model
+from sfm_audit.loaders.camera_models import CAMERA_MODELS
 
 POSE_TOLERANCE = 1e-12
 NUM_MODELS = 18

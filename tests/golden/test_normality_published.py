@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit import normality
-from audit.normality.null_tables import NullTable, load, modified_normal, null_p
+from sfm_audit.audit import normality
+from sfm_audit.audit.normality.null_tables import NullTable, load, modified_normal, null_p
 
 # Molin & Abdi, "New tables and numerical approximation for the Kolmogorov-Smirnov/Lilliefors/Van Soest test of
 # normality" (1998), 100,000 draws: critical D at 20, 15, 10, 5 and 1 %.

@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from audit import normality
-from audit.normality.kolmogorov import kolmogorov_p, one_sided_p
+from sfm_audit.audit import normality
+from sfm_audit.audit.normality.kolmogorov import kolmogorov_p, one_sided_p
 
 SIZES = (8, 9, 11, 12, 20, 40, 79, 80, 141, 400, 1000, 4000)
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import Distortion
-from audit.calibrate.estimators import ESTIMATORS, estimator
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.camera import Distortion
+from sfm_audit.audit.calibrate.estimators import ESTIMATORS, estimator
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 seeds = st.integers(0, 2**32 - 1)
 names = st.sampled_from(["D1", "D3", "pnprf", "colmap"])

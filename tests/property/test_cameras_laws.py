@@ -5,8 +5,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from audit.cameras import normalised, project, project_with_jacobians, unproject
-from loaders.camera_models import CAMERA_MODELS, CameraModel
+from sfm_audit.audit.cameras import normalised, project, project_with_jacobians, unproject
+from sfm_audit.loaders.camera_models import CAMERA_MODELS, CameraModel
 
 SPHERICAL = tuple(model for model in CAMERA_MODELS if model.is_spherical)
 PERSPECTIVE = tuple(model for model in CAMERA_MODELS if not model.is_spherical)

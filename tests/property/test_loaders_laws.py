@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from model_writer import UNLINKED, Camera, Frame, Image, Model, Point, Rig, write_binary, write_text
 from numpy.testing import assert_array_equal
 
-from loaders import SparseModel, open_model
-from loaders.lookup import rows_of
-from loaders.track_consistency import compare_tracks
+from sfm_audit.loaders import SparseModel, open_model
+from sfm_audit.loaders.assembly.lookup import rows_of
+from sfm_audit.loaders.assembly.track_consistency import compare_tracks
 
 LAW = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
@@ -98,7 +98,7 @@ def _raw_points(model: Model):
     from pathlib import Path  # noqa: PLC0415
     from tempfile import TemporaryDirectory  # noqa: PLC0415
 
-    from loaders.colmap_binary import read_points  # noqa: PLC0415
+    from sfm_audit.loaders.colmap.binary import read_points  # noqa: PLC0415
 
     with TemporaryDirectory() as folder:
         return read_points(write_binary(Path(folder), model) / "points3D.bin")

@@ -13,9 +13,17 @@ from misfit_reference import PARAMS, camera, points
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit import misfit
-from audit.misfit import GROUPS, MisfitGroup, candidate_fields, nuisance_columns, prepare, prepare_image, project_image
-from loaders.model import CameraRecord
+from sfm_audit.audit import misfit
+from sfm_audit.audit.misfit import (
+    GROUPS,
+    MisfitGroup,
+    candidate_fields,
+    nuisance_columns,
+    prepare,
+    prepare_image,
+    project_image,
+)
+from sfm_audit.loaders.model import CameraRecord
 
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from(sorted(PARAMS))

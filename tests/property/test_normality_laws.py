@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.testing import assert_allclose
 
-from audit import normality
-from audit.multiplicity import benjamini_hochberg, holm
-from audit.normality.kolmogorov import kolmogorov_p
-from audit.normality.null_tables import NullTable, null_p
+from sfm_audit.audit import normality
+from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
+from sfm_audit.audit.normality.kolmogorov import kolmogorov_p
+from sfm_audit.audit.normality.null_tables import NullTable, null_p
 
 
 @st.composite

@@ -11,11 +11,11 @@ import pycolmap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from audit.simulate.adjust import residuals_px, sparse_model, true_claim
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.adjust import residuals_px, sparse_model, true_claim
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 SIZED = [kind for kind in DefectKind if kind is not DefectKind.FEW_POINTS]
 seeds = st.integers(0, 2**32 - 1)

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit import AuditConfig, ModelAuditor, audit_model
-from audit.blame import Peeling
-from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, MisfitTest
-from audit.misfit.basis import nuisance_basis, nuisance_transform, unit_columns
-from audit.misfit.outcome import not_tested
-from audit.simulate.adjust import adjust_scene, sparse_model
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit import AuditConfig, ModelAuditor, audit_model
+from sfm_audit.audit.misfit import GROUPS, MisfitGroup, MisfitStatus, MisfitTest
+from sfm_audit.audit.misfit.basis import nuisance_basis, nuisance_transform, unit_columns
+from sfm_audit.audit.misfit.outcome import not_tested
+from sfm_audit.audit.misfit.peeling import Peeling
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 WRONG = (1, 5, 8, 13)
 

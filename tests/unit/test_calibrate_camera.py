@@ -12,8 +12,8 @@ from calibrate_samples import DIVISION, FORWARD
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate import camera as module
-from audit.calibrate.camera import CalibratedCamera
+from sfm_audit.audit.calibrate import camera as module
+from sfm_audit.audit.calibrate.camera import CalibratedCamera
 
 CAMERAS = {"forward": FORWARD, "division": DIVISION}
 ALL = ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from calibrate_samples import FOCAL, FORWARD, LENS, SIZE, board, room, with_outliers
 
-from audit.calibrate.degenerate import check_camera
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError, estimate_of
-from audit.calibrate.estimators import ESTIMATORS
-from loaders.correspondences import Correspondences
+from sfm_audit.audit.calibrate.degenerate import check_camera
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError, estimate_of
+from sfm_audit.audit.calibrate.estimators import ESTIMATORS
+from sfm_audit.loaders.correspondences.records import Correspondences
 
 NAMES = sorted(ESTIMATORS)
 NUM_PARAMETERS = {"D1": 8, "D3": 10, "pnprf": 10, "colmap": 9}

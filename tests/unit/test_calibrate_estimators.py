@@ -13,12 +13,12 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.absolute_pose import absolute_pose
-from audit.calibrate.consensus import CentredPoints
-from audit.calibrate.eaprd import eaprd
-from audit.calibrate.estimators import ESTIMATORS, estimator
-from audit.calibrate.radial_pose import RadialPoses, complete, minimal_radial_poses, robust_radial_pose
-from audit.calibrate.refine import _cross_matrix, _left_jacobian, _Problem, fit_at, refine
+from sfm_audit.audit.calibrate.absolute_pose import absolute_pose
+from sfm_audit.audit.calibrate.consensus import CentredPoints
+from sfm_audit.audit.calibrate.eaprd import eaprd
+from sfm_audit.audit.calibrate.estimators import ESTIMATORS, estimator
+from sfm_audit.audit.calibrate.radial_pose import RadialPoses, complete, minimal_radial_poses, robust_radial_pose
+from sfm_audit.audit.calibrate.refine import _cross_matrix, _left_jacobian, _Problem, fit_at, refine
 
 NAMES = sorted(ESTIMATORS)
 

@@ -13,23 +13,23 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError, estimate_of
-from audit.calibrate.evidence import camera_folds, correlation_focal_depth, expected_error_of, plane_geometry
-from audit.calibrate.lens_misfit import expected_points, misfit_tests
-from audit.calibrate.rows import calibration_row, calibration_table, degenerate_row, residuals_table
-from audit.calibrate.undistort import undistort_image, undistort_map
-from audit.calibrate.validation import DEFAULTS, validate
-from audit.expected_error import expected_error_map
-from audit.misfit import MisfitGroup, MisfitStatus, candidate_fields, prepare
-from audit.plausibility import folds_over
-from audit.standardise import constant_noise
-from audit.table import CALIBRATION, CALIBRATION_RESIDUALS, schema
-from audit.verdict import ReasonCode, Verdict
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord
-from reports.calibration import render_calibration
-from reports.drawing import Page
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError, estimate_of
+from sfm_audit.audit.calibrate.evidence import camera_folds, correlation_focal_depth, expected_error_of, plane_geometry
+from sfm_audit.audit.calibrate.lens_misfit import expected_points, misfit_tests
+from sfm_audit.audit.calibrate.rows import calibration_row, calibration_table, degenerate_row, residuals_table
+from sfm_audit.audit.calibrate.undistort import undistort_image, undistort_map
+from sfm_audit.audit.calibrate.validation import DEFAULTS, validate
+from sfm_audit.audit.camera_quality.expected_error import expected_error_map
+from sfm_audit.audit.camera_quality.plausibility import folds_over
+from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
+from sfm_audit.audit.misfit import MisfitGroup, MisfitStatus, candidate_fields, prepare
+from sfm_audit.audit.noise.standardise import constant_noise
+from sfm_audit.audit.table import CALIBRATION, CALIBRATION_RESIDUALS, schema
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord
+from sfm_audit.reports.text.calibration import render_calibration
+from sfm_audit.reports.text.drawing import Page
 
 REJECTED, UNDETERMINED, ACCEPTED = Verdict.REJECTED, Verdict.UNDETERMINED, Verdict.ACCEPTED
 SETTINGS = {"alpha": 0.05, "min_effect": "0.5sigma", "policy": "full"}

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from audit.cameras import project, project_with_jacobians, unproject
-from audit.cameras.fisheye import angle_curvature, angle_gain
-from loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
+from sfm_audit.audit.cameras import project, project_with_jacobians, unproject
+from sfm_audit.audit.cameras.fisheye import angle_curvature, angle_gain
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
 
 NAMES = [model.name for model in CAMERA_MODELS]
 PLAIN = {"f": 900.0, "fx": 900.0, "fy": 950.0, "cx": 800.0, "cy": 600.0, "w": 1600.0, "h": 800.0}

@@ -5,8 +5,15 @@ import pycolmap
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from audit.cameras import distorted_normalised, is_fisheye, normalised, project, project_with_jacobians, unproject
-from loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
+from sfm_audit.audit.cameras import (
+    distorted_normalised,
+    is_fisheye,
+    normalised,
+    project,
+    project_with_jacobians,
+    unproject,
+)
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
 
 WIDTH, HEIGHT = 1600, 1200
 NAMES = [model.name for model in CAMERA_MODELS]

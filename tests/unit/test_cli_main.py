@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 import pytest
 
-from audit.cli import auditing, main
-from audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli import auditing, main
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def raising(monkeypatch):
 
 def test_help_names_every_verb_and_costs_no_science():
     code = (
-        "import sys\nfrom audit.cli.main import main\nmain(['--help'])\n"
+        "import sys\nfrom sfm_audit.audit.cli.main import main\nmain(['--help'])\n"
         "heavy = {'numpy', 'scipy', 'pyarrow', 'pandas', 'pycolmap', 'pydantic', 'rich', 'tqdm'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
@@ -101,7 +101,7 @@ def test_an_unknown_error_keeps_its_traceback(raising):
 
 
 def test_output_that_the_terminal_cannot_show_is_shown_by_code():
-    code = "from audit.cli.auditing import print_page; print_page('Zürich 東')"
+    code = "from sfm_audit.audit.cli.auditing import print_page; print_page('Zürich 東')"
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
     assert done.stdout == "Z\\xfcrich \\u6771\n"

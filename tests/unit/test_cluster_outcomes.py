@@ -8,9 +8,9 @@ pytest.importorskip("distributed")
 
 from distributed import KilledWorker
 
-from audit.schedule.cluster import _outcome
-from audit.schedule.errors import ClusterError
-from audit.schedule.task import Failure, Unchanged
+from sfm_audit.audit.schedule.cluster import _outcome
+from sfm_audit.audit.schedule.errors import ClusterError
+from sfm_audit.audit.schedule.task import Failure, Unchanged
 
 
 @pytest.mark.parametrize("is_connected", [True, False])

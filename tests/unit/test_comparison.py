@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from reports.comparison import ImageKey, ImageState, RunSnapshot, Scope, Systematic, compare
-from reports.comparison_page import MAX_NAMES, render_comparison
-from reports.drawing import Page
+from sfm_audit.reports.compare.comparison import ImageKey, ImageState, RunSnapshot, Scope, Systematic, compare
+from sfm_audit.reports.compare.page import MAX_NAMES, render_comparison
+from sfm_audit.reports.text.drawing import Page
 
 MODEL = ("d", "s", "0", "d/s/0")
 

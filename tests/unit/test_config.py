@@ -1,9 +1,9 @@
 import pytest
 from pydantic import ValidationError
 
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.settings import read_config
-from audit.config import AuditConfig
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.config import AuditConfig
 
 
 def write(tmp_path, text):

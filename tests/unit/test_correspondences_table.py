@@ -13,9 +13,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from loaders.correspondences_table import read_correspondences
-from loaders.errors import LfsPointerError, LoadError, MalformedFileError, MissingFileError, TruncatedFileError
-from loaders.gridded_scan import GriddedScan
+from sfm_audit.loaders.correspondences.gridded_scan import GriddedScan
+from sfm_audit.loaders.correspondences.table import read_correspondences
+from sfm_audit.loaders.errors import (
+    LfsPointerError,
+    LoadError,
+    MalformedFileError,
+    MissingFileError,
+    TruncatedFileError,
+)
 
 HEAD = "# width=1600 height=1200\n"
 PLAIN = ("x", "y", "X", "Y", "Z")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from audit.coverage import coverage, hull_area_px2, occupied_cells
+from sfm_audit.audit.camera_quality.coverage import coverage, hull_area_px2, occupied_cells
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(13, 400), integer=st.booleans())

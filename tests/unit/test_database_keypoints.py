@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from model_writer import Camera, Image, Model, Point, write_binary
 from numpy.testing import assert_allclose
 
-from loaders import (
+from sfm_audit.loaders import (
     LfsPointerError,
     LoadError,
     MalformedFileError,
@@ -22,8 +22,8 @@ from loaders import (
     UnreadableFileError,
     open_model,
 )
-from loaders.colmap_database import find_database, read_keypoint_shapes
-from loaders.model import SparseModel
+from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders.model import SparseModel
 
 UNLINKED = 2**64 - 1
 NAMES = ("b.jpg", "a b/é 1.png", "no keypoints.jpg")

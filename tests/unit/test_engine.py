@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from audit import AuditConfig, ModelAuditor, audit_inliers, audit_model
-from audit.simulate.adjust import adjust_scene, sparse_model
-from audit.simulate.noise import NoiseKind, NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders.model import FindingCode
+from sfm_audit.audit import AuditConfig, ModelAuditor, audit_inliers, audit_model
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders.model import FindingCode
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project
-from audit.expected_error import cell_centres_px, expected_error_map, grid_rays, median_depth
-from audit.identifiability import fitted_names, parameter_covariance
-from audit.misfit.nuisance import nuisance_columns, project_image
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord
+from sfm_audit.audit.camera_quality.expected_error import cell_centres_px, expected_error_map, grid_rays, median_depth
+from sfm_audit.audit.camera_quality.identifiability import fitted_names, parameter_covariance
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord
 
 
 def camera_of(name="SIMPLE_RADIAL", params=(1000.0, 800.0, 600.0, -0.05), width=1600, height=1200):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from run_samples import sample_table
 
-from audit.verdict import ReasonCode
-from reports.explain import LIMITS, REASON_CODES, Story, plain_reason, render_story, strongest_where
+from sfm_audit.audit.decision.verdict import ReasonCode
+from sfm_audit.reports.text.explain import LIMITS, REASON_CODES, Story, plain_reason, render_story, strongest_where
 
 SIZE = (1600.0, 1200.0)
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from reports import figures
-from reports.figures import CAPTIONS, ResidualError, Residuals
-from reports.figures.sensor import evenly
+from sfm_audit.reports import figures
+from sfm_audit.reports.figures import CAPTIONS, ResidualError, Residuals
+from sfm_audit.reports.figures.sensor import evenly
 
 SIZE = (1600.0, 1200.0)
 IMAGE_FIGURES = [

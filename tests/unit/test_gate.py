@@ -9,10 +9,10 @@ from gate_samples import NASTY, but, rejected, scene, without, write_run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from reports.comparison import RunSnapshot, Scope, compare
-from reports.gate import judge
-from reports.gate_policy import Band, GatePolicy
-from reports.learning import gate_toml, learn_bands
+from sfm_audit.reports.compare.comparison import RunSnapshot, Scope, compare
+from sfm_audit.reports.compare.gate import judge
+from sfm_audit.reports.compare.gate_policy import Band, GatePolicy
+from sfm_audit.reports.compare.learning import gate_toml, learn_bands
 
 EMPTY = GatePolicy()
 _count = iter(range(10**6))

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from audit.cli.errors import ExitCode, KnownError
-from audit.cli.gate_file import read_gate_file
+from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.gate_file import read_gate_file
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from report_samples import NASTY_NAMES, read_sample
 
-from reports import html
-from reports.figures import Residuals, residual_vectors
-from reports.html.content import judged_under
-from reports.html.photos import find_photo, read_photo
-from reports.html.svg import to_svg
-from reports.wording import plain
+from sfm_audit.reports import html
+from sfm_audit.reports.figures import Residuals, residual_vectors
+from sfm_audit.reports.html.content import judged_under
+from sfm_audit.reports.html.photos import find_photo, read_photo
+from sfm_audit.reports.html.svg import to_svg
+from sfm_audit.reports.text.wording import plain
 
 
 @pytest.fixture(autouse=True)

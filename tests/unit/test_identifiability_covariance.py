@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project
-from audit.identifiability import fitted_names, identifiability, parameter_covariance
-from audit.misfit.nuisance import nuisance_columns, project_image
-from loaders.camera_models import BY_NAME, CAMERA_MODELS
-from loaders.model import CameraRecord
+from sfm_audit.audit.camera_quality.identifiability import fitted_names, identifiability, parameter_covariance
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
+from sfm_audit.loaders.model import CameraRecord
 
 CAMERAS = {
     "SIMPLE_RADIAL": (1000.0, 800.0, 600.0, -0.05),

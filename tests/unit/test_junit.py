@@ -12,12 +12,12 @@ from xml.etree import ElementTree as ET
 import pytest
 from gate_samples import NASTY, rejected, scene, write_run
 
-from reports.comparison import RunSnapshot, compare
-from reports.gate import judge
-from reports.gate_policy import GatePolicy
-from reports.gate_report import GateReport, render_json
-from reports.junit import MAX_NAMES, render_junit
-from reports.wording import plain
+from sfm_audit.reports.compare.comparison import RunSnapshot, compare
+from sfm_audit.reports.compare.gate import judge
+from sfm_audit.reports.compare.gate_policy import GatePolicy
+from sfm_audit.reports.compare.gate_report import GateReport, render_json
+from sfm_audit.reports.compare.junit import MAX_NAMES, render_junit
+from sfm_audit.reports.text.wording import plain
 
 SUITE = {"name", "package", "id", "timestamp", "hostname", "time", "tests", "failures", "errors"}
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import integrate, stats
 
-from audit.keypoint_noise import fit_scale_power, keypoint_noise, keypoint_tracks, scale_only_noise
-from audit.normality import normality_tests as normality_of
-from audit.residuals import ModelResiduals, model_residuals
-from audit.standardise import model_tracks, track_noise
-from loaders import open_model
-from loaders.colmap_database import find_database, read_keypoint_shapes
+from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
+from sfm_audit.audit.noise.keypoint import fit_scale_power, keypoint_noise, keypoint_tracks, scale_only_noise
+from sfm_audit.audit.noise.standardise import model_tracks, track_noise
+from sfm_audit.audit.normality import normality_tests as normality_of
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
 
 THRESHOLDS = {"pose_offset_threshold_px": 0.5, "min_track_length": 3, "min_eigenvalue": 0.05}
 

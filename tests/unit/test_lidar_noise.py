@@ -12,14 +12,14 @@ from numpy.testing import assert_allclose
 from scipy import optimize, stats
 from scipy.spatial.transform import Rotation
 
-from audit.calibrate.camera import CalibratedCamera, Distortion
-from audit.calibrate.estimate import Estimate, estimate_of
-from audit.calibrate.lidar import lidar_noise, lidar_predictors
-from audit.noise import fit_variance
-from audit.noise_variants import fit_variance_likelihood, fit_variance_literal, literal_start
-from loaders.correspondences import Correspondences
-from loaders.correspondences_table import read_correspondences
-from loaders.scan_ptx import read_ptx
+from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
+from sfm_audit.audit.calibrate.estimate import Estimate, estimate_of
+from sfm_audit.audit.calibrate.lidar import lidar_noise, lidar_predictors
+from sfm_audit.audit.noise.fits import fit_variance
+from sfm_audit.audit.noise.variants import fit_variance_likelihood, fit_variance_literal, literal_start
+from sfm_audit.loaders.correspondences.records import Correspondences
+from sfm_audit.loaders.correspondences.scan_ptx import read_ptx
+from sfm_audit.loaders.correspondences.table import read_correspondences
 
 PAN_STEP, TILT_STEP = 2e-3, 1e-3  # rad
 CAMERA = CalibratedCamera(

@@ -6,8 +6,8 @@ import pytest
 from model_writer import UNLINKED, Camera, Image, Model, Point, binary_files, rig_model, tiny_model, write_binary
 from numpy.testing import assert_array_equal
 
-from loaders import LoadError, MalformedFileError, TruncatedFileError, open_model
-from loaders.errors import Position
+from sfm_audit.loaders import LoadError, MalformedFileError, TruncatedFileError, open_model
+from sfm_audit.loaders.errors import Position
 
 
 def load(folder: Path, model: Model):

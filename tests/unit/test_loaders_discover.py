@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from corpus import needs_corpus
 
-from loaders import MissingFileError, UnreadableFileError, discover
-from loaders.discover import scene_and_component
+from sfm_audit.loaders import MissingFileError, UnreadableFileError, discover
+from sfm_audit.loaders.datasets.discover import scene_and_component
 
 
 def plant(root: Path, *folders: str, name: str = "images.bin") -> Path:

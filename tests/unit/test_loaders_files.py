@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from model_writer import binary_files, rig_model, text_files, tiny_model, write_binary, write_text
 
-from loaders import (
+from sfm_audit.loaders import (
     FindingCode,
     InputFile,
     LfsPointerError,

@@ -7,7 +7,7 @@ import pytest
 from corpus import needs_corpus
 from model_writer import UNLINKED, Camera, Image, Model, Point, tiny_model, write_binary, write_text
 
-from loaders import FindingCode, open_model
+from sfm_audit.loaders import FindingCode, open_model
 
 NAN, INF = float("nan"), float("inf")
 CAMERAS, IMAGES, POINTS = tiny_model().cameras, tiny_model().images, tiny_model().points

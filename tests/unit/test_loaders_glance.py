@@ -7,8 +7,8 @@ import pytest
 from corpus import parametrize_models
 from model_writer import tiny_model, write_binary, write_text
 
-from loaders import LoadError, MissingFileError, TruncatedFileError, open_model
-from loaders.glance import count_images, count_images_of
+from sfm_audit.loaders import LoadError, MissingFileError, TruncatedFileError, open_model
+from sfm_audit.loaders.datasets.image_counts import count_images, count_images_of
 
 
 @pytest.mark.parametrize("write", [write_binary, write_text])

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from model_writer import tiny_model, write_binary, write_text
 
-from loaders import Discovery, MissingFileError, discover
-from loaders.layouts import LAYOUTS
+from sfm_audit.loaders import Discovery, MissingFileError, discover
+from sfm_audit.loaders.datasets.layouts import LAYOUTS
 
 # layout, folder below the root, scene, component: as the data sets have them
 KNOWN = [

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loaders import MissingFileError, UnreadableFileError, discover, open_model
-from loaders.colmap_database import find_database
-from loaders.locations import RemotePath, below, parse_location, real_location
+from sfm_audit.loaders import MissingFileError, UnreadableFileError, discover, open_model
+from sfm_audit.loaders.colmap.database import find_database
+from sfm_audit.loaders.paths.locations import RemotePath, below, parse_location, real_location
 
 names = st.text(st.characters(exclude_characters="/?&@", exclude_categories=["Cs"]), min_size=1).filter(
     lambda name: name not in {".", ".."}

@@ -3,7 +3,8 @@
 import pyarrow.fs
 import pytest
 
-from loaders import LoadError, MissingFileError, UnreadableFileError, discover, open_model, remote
+from sfm_audit.loaders import LoadError, MissingFileError, UnreadableFileError, discover, open_model
+from sfm_audit.loaders.paths import remote
 
 S3 = "When listing objects under key 'x/' in bucket 'b': AWS Error {} during ListObjectsV2 operation: {}"
 GS = "google::cloud::Status({}: {} error_info={{reason=, domain=, metadata={{}}}})"

@@ -7,7 +7,7 @@ from model_writer import Frame, Rig, rig_model, write_binary, write_text
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from loaders import FindingCode, open_model
+from sfm_audit.loaders import FindingCode, open_model
 
 SOURCE = rig_model()
 FRONT, BACK = (frame.pose for frame in SOURCE.frames)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from loaders import LoadError, ModelRef
-from loaders.discover import Discovery
-from loaders.selection import Selection, read_scene_list, select
+from sfm_audit.loaders import LoadError, ModelRef
+from sfm_audit.loaders.datasets.discover import Discovery
+from sfm_audit.loaders.datasets.selection import Selection, read_scene_list, select
 
 NAMES = [("0001", "0"), ("0001", "1"), ("0022", "0"), ("001/234", "0"), ("001/235", "0")]
 FOUND = Discovery(tuple(ModelRef("d", s, c, f"/{s}-{c}", f"{s}-{c}") for s, c in NAMES), ())

@@ -5,8 +5,8 @@ import pytest
 from model_writer import UNLINKED, Camera, Image, Point, rig_model, text_files, tiny_model, write_text
 from numpy.testing import assert_array_equal
 
-from loaders import FindingCode, LoadError, MalformedFileError, TruncatedFileError, open_model
-from loaders.errors import Position
+from sfm_audit.loaders import FindingCode, LoadError, MalformedFileError, TruncatedFileError, open_model
+from sfm_audit.loaders.errors import Position
 
 
 def rewrite(folder: Path, name: str, change) -> Path:

@@ -4,12 +4,12 @@ from pathlib import Path
 import pytest
 from gate_samples import NASTY, rejected, scene, write_run
 
-from reports.comparison import RunSnapshot, compare
-from reports.gate import judge
-from reports.gate_policy import GatePolicy
-from reports.gate_report import GateReport
-from reports.markdown import MAX_BYTES, render_markdown, text
-from reports.wording import plain
+from sfm_audit.reports.compare.comparison import RunSnapshot, compare
+from sfm_audit.reports.compare.gate import judge
+from sfm_audit.reports.compare.gate_policy import GatePolicy
+from sfm_audit.reports.compare.gate_report import GateReport
+from sfm_audit.reports.compare.markdown import MAX_BYTES, render_markdown, text
+from sfm_audit.reports.text.wording import plain
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +58,7 @@ def test_table_rows_have_three_cells(tmp_path):
 
 
 def test_the_size_stays_below_what_github_shows(tmp_path, monkeypatch):
-    monkeypatch.setattr("reports.markdown.MAX_BYTES", 20_000)
+    monkeypatch.setattr("sfm_audit.reports.compare.markdown.MAX_BYTES", 20_000)
     page = render_markdown(report(tmp_path, 30, ["東" * 300 + f"{i}" for i in range(25)]))
     assert len(page.encode()) <= 20_000
     assert re.search(r"\.\.\. and \d+ more lines; all of them are in the file of --json\n$", page)

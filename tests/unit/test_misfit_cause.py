@@ -9,8 +9,8 @@ import pytest
 from misfit_reference import PARAMS, camera, points, refit, residuals_of
 from numpy.testing import assert_allclose
 
-from audit.cameras import project
-from audit.misfit import (
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.misfit import (
     GROUPS,
     MisfitGroup,
     MisfitStatus,
@@ -22,8 +22,8 @@ from audit.misfit import (
     prepare_image,
     remaining_groups,
 )
-from audit.misfit.capabilities import TERMS, extended_params, larger_models, undistorted_model
-from loaders.camera_models import BY_NAME, CAMERA_MODELS
+from sfm_audit.audit.misfit.capabilities import TERMS, extended_params, larger_models, undistorted_model
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
 
 G = MisfitGroup
 NOT_RUN = MisfitTest(math.nan, math.nan, None, MisfitStatus.NOT_ENOUGH_EVIDENCE)

@@ -7,12 +7,12 @@ import pytest
 from misfit_reference import HEIGHT, WIDTH, camera, points
 from numpy.testing import assert_allclose
 
-from audit.cameras import project
-from audit.misfit import MisfitGroup, candidate_fields, fitted_param_idxs, nuisance_columns, project_image
-from audit.misfit.fields import GROUP_COLUMNS
-from audit.simulate.defects import DefectKind, with_defect
-from audit.simulate.truth import NUM_TRUE_PARAMS, TrueCameras, project_true
-from loaders.camera_models import BY_NAME
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.misfit import MisfitGroup, candidate_fields, fitted_param_idxs, nuisance_columns, project_image
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.audit.simulate.defects import DefectKind, with_defect
+from sfm_audit.audit.simulate.truth import NUM_TRUE_PARAMS, TrueCameras, project_true
+from sfm_audit.loaders.camera_models import BY_NAME
 
 STEP = 1e-6
 

@@ -9,8 +9,8 @@ import pytest
 from misfit_reference import camera, interleaved, planar_points, points, slow_tests
 from numpy.testing import assert_allclose
 
-from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, camera_tests, image_design, project_image
-from audit.misfit.fields import NUM_FIELDS
+from sfm_audit.audit.misfit import GROUPS, MisfitGroup, MisfitStatus, camera_tests, image_design, project_image
+from sfm_audit.audit.misfit.fields import NUM_FIELDS
 
 NUM_TRACKS = 500
 

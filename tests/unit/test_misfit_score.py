@@ -11,10 +11,10 @@ from misfit_reference import PARAMS, camera, columns_of, interleaved, planar_poi
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from audit.misfit import GROUPS, MisfitGroup, MisfitStatus, prepare, prepare_image, project_image
-from audit.misfit.basis import field_transform, largest_sq
-from audit.misfit.outcome import judged_by_f
-from loaders.camera_models import CAMERA_MODELS
+from sfm_audit.audit.misfit import GROUPS, MisfitGroup, MisfitStatus, prepare, prepare_image, project_image
+from sfm_audit.audit.misfit.basis import field_transform, largest_sq
+from sfm_audit.audit.misfit.outcome import judged_by_f
+from sfm_audit.loaders.camera_models import CAMERA_MODELS
 
 
 def assert_equal_to_reference(found, reference):

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import integrate, stats
 
-from audit.noise import CONSISTENCY, CUTOFF, _excess, _first_step, fit_constant_variance, fit_variance, scoring_step
+from sfm_audit.audit.noise.fits import (
+    CONSISTENCY,
+    CUTOFF,
+    _excess,
+    _first_step,
+    fit_constant_variance,
+    fit_variance,
+    scoring_step,
+)
 
 
 def as_written(y, predictor, iterations=3000):

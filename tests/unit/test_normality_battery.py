@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit import normality
-from audit.normality.kolmogorov import kolmogorov_p
-from audit.normality.null_tables import NullTable, load, null_p
+from sfm_audit.audit import normality
+from sfm_audit.audit.normality.kolmogorov import kolmogorov_p
+from sfm_audit.audit.normality.null_tables import NullTable, load, null_p
 
 
 def floats(tests):
@@ -186,6 +186,7 @@ def test_between_tabulated_sizes_p_goes_with_the_inverse_root(table, size):
 
 
 def test_the_package_does_not_import_scipy_stats():
-    code = "import sys, audit.normality, audit.multiplicity; print('scipy.stats' in sys.modules)"
+    modules = "sys, sfm_audit.audit.normality, sfm_audit.audit.misfit.multiplicity"
+    code = f"import {modules}; print('scipy.stats' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

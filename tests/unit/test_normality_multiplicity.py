@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from audit.multiplicity import benjamini_hochberg, holm
+from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
 
 # Benjamini & Hochberg (1995), section 4: fifteen p-values of a thrombolysis study; at 5 % Hochberg's procedure rejects
 # three, theirs four.

@@ -11,11 +11,11 @@ from corpus import CORPUS, needs_corpus
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from audit.cameras import unproject
-from audit.plausibility import camera_plausibility, folds_over
-from loaders import open_model
-from loaders.camera_models import BY_NAME, CAMERA_MODELS
-from loaders.model import CameraRecord
+from sfm_audit.audit.camera_quality.plausibility import camera_plausibility, folds_over
+from sfm_audit.audit.cameras import unproject
+from sfm_audit.loaders import open_model
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
+from sfm_audit.loaders.model import CameraRecord
 
 
 def camera_of(name, params, width=1600, height=1200):

@@ -7,9 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from audit.identifiability import Identifiability, ParameterCovariance
-from audit.plausibility import CameraPlausibility, PlausibilityLimits, judge_plausible, judge_pose
-from audit.verdict import REASON_MEANINGS, ReasonCode, Verdict
+from sfm_audit.audit.camera_quality.identifiability import Identifiability, ParameterCovariance
+from sfm_audit.audit.camera_quality.plausibility import (
+    CameraPlausibility,
+    PlausibilityLimits,
+    judge_plausible,
+    judge_pose,
+)
+from sfm_audit.audit.decision.verdict import REASON_MEANINGS, ReasonCode, Verdict
 
 ACCEPTED, REJECTED, UNDETERMINED = Verdict.ACCEPTED, Verdict.REJECTED, Verdict.UNDETERMINED
 

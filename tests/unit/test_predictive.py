@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import optimize, stats
 
-from audit.noise import fit_constant_variance
-from audit.predictive import (
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.noise.predictive import (
     StudentToNormal,
     TrackStandardiser,
     fit_track_prior,

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_writer import Image, Point, rig_model, tiny_model, write_binary, write_text
 
-from loaders import LoadError, open_model
-from reports.pruned_model import MODEL_FILES, plan_pruning, write_pruned
+from sfm_audit.loaders import LoadError, open_model
+from sfm_audit.reports.export.pruned_model import MODEL_FILES, plan_pruning, write_pruned
 
 FORMATS = {"binary": write_binary, "text": write_text}
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit.misfit.basis import nuisance_basis, unit_columns
-from audit.refit import refit_points
-from audit.residuals import ModelResiduals
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.misfit.basis import nuisance_basis, unit_columns
+from sfm_audit.audit.misfit.refit import refit_points
 
 
 def random_problem(rng, num_images=6, num_points=40, share=0.7):

@@ -5,10 +5,10 @@ import pytest
 import threadpoolctl
 from run_samples import write_models
 
-from audit.config import AuditConfig
-from audit.runner import Failure, audit_many, audit_one
-from loaders import discover
-from loaders.input_state import InputState, input_stamp, read_input_state
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.schedule.runner import Failure, audit_many, audit_one
+from sfm_audit.loaders import discover
+from sfm_audit.loaders.datasets.input_state import InputState, input_stamp, read_input_state
 
 
 class Memory:
@@ -69,7 +69,7 @@ def test_failures_are_told_in_the_order_given_whatever_finishes_first(refs, monk
     for ref in refs[:3]:
         Path(ref.location, "images.bin").write_bytes(b"short")
     backwards = lambda tasks, audit: ((task, audit(task)) for task in reversed(tasks))  # noqa: E731
-    monkeypatch.setattr("audit.runner._in_this_process", backwards)
+    monkeypatch.setattr("sfm_audit.audit.schedule.runner._in_this_process", backwards)
     assert [failure.location for failure in run(refs, Memory())] == [ref.model_path for ref in refs[:3]]
 
 
@@ -98,7 +98,7 @@ def test_a_bug_says_which_model_it_met(refs, monkeypatch):
     def broken(*_: object, **__: object):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("audit.schedule.task.audit_model", broken)
+    monkeypatch.setattr("sfm_audit.audit.schedule.task.audit_model", broken)
     with pytest.raises(ZeroDivisionError) as caught:
         run(refs, Memory())
     assert caught.value.__notes__ == [f"while auditing {refs[0].model_path}"]

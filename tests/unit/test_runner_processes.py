@@ -14,14 +14,14 @@ import threadpoolctl
 from corpus import UNREADABLE, corpus_models
 from run_samples import make_ref, wait_for, write_models
 
-from audit.config import AuditConfig
-from audit.engine import ModelAuditor, audit_model
-from audit.schedule.images import image_processes, read_shared, write_shared
-from audit.schedule.lanes import Died, Lanes, RemoteTracebackError
-from audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
-from audit.schedule.task import Audited, Failure, Task, audit_one
-from audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
-from loaders import discover, open_model
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine.model import ModelAuditor, audit_model
+from sfm_audit.audit.schedule.images import image_processes, read_shared, write_shared
+from sfm_audit.audit.schedule.lanes import Died, Lanes, RemoteTracebackError
+from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
+from sfm_audit.audit.schedule.task import Audited, Failure, Task, audit_one
+from sfm_audit.audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
+from sfm_audit.loaders import discover, open_model
 
 GB = 1_000_000_000
 CONFIG = AuditConfig()
@@ -114,7 +114,7 @@ def test_without_room_for_the_shared_file_the_images_are_audited_in_turn(scene, 
         raise OSError(28, "No space left on device")
 
     with image_processes(2) as spread:
-        monkeypatch.setattr("audit.schedule.images.write_shared", full)
+        monkeypatch.setattr("sfm_audit.audit.schedule.images.write_shared", full)
         assert audited(scene, spread)["images"].equals(audited(scene)["images"])
 
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from loaders import scan_ptx
-from loaders.errors import LfsPointerError, MalformedFileError, TruncatedFileError
-from loaders.gridded_scan import GriddedScan, neighbours
-from loaders.scan_ptx import read_ptx
+from sfm_audit.loaders.correspondences import scan_ptx
+from sfm_audit.loaders.correspondences.gridded_scan import GriddedScan, neighbours
+from sfm_audit.loaders.correspondences.scan_ptx import read_ptx
+from sfm_audit.loaders.errors import LfsPointerError, MalformedFileError, TruncatedFileError
 
 IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 SCANNER = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"

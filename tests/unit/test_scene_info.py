@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from corpus import CORPUS, needs_corpus
 
-from loaders import LoadError
-from loaders.scene_info import read_scene_info
-from reports.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
-from reports.selection import AuditedImage, Keep
+from sfm_audit.loaders import LoadError
+from sfm_audit.loaders.scene_info.file import read_scene_info
+from sfm_audit.reports.export.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
+from sfm_audit.reports.export.selection import AuditedImage, Keep
 
 NUM = 6
 NAMES = [f"{i:03d}_o.jpg" for i in range(NUM)]

@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from loaders import LoadError
-from loaders.inert_pickle import RefusedPickleError, load_inert
-from loaders.scene_info import read_scene_info
+from sfm_audit.loaders import LoadError
+from sfm_audit.loaders.scene_info.file import read_scene_info
+from sfm_audit.loaders.scene_info.inert_pickle import RefusedPickleError, load_inert
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 

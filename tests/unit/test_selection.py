@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from model_writer import tiny_model, write_binary
 from run_samples import make_ref, sample_tables, settings
 
-from loaders import ModelRef
-from loaders.input_state import InputState, read_input_state
-from reports.errors import RunFolderError
-from reports.reader import RunReader
-from reports.selection import (
+from sfm_audit.loaders import ModelRef
+from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
+from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.export.selection import (
     Keep,
     images_of_model,
     list_text,
@@ -25,7 +24,8 @@ from reports.selection import (
     removed_text,
     unquoted,
 )
-from reports.store import RunStore
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
 
 VERDICTS = ("accepted", "rejected", "undetermined")
 NAMES = [

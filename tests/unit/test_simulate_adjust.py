@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.adjust import (
+from sfm_audit.audit.simulate.adjust import (
     AdjustmentError,
     Claim,
     adjust_scene,
@@ -19,10 +19,10 @@ from audit.simulate.adjust import (
     write_adjusted_model,
     write_model,
 )
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 SPEC = SceneSpec(num_images=20, points_per_image=300, noise=NoiseSpec(sigma_px=0.5))
 

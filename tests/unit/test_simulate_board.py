@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.board import BoardSpec, board_sets
-from audit.simulate.lidar_scan import LidarSpec, scan
+from sfm_audit.audit.simulate.board import BoardSpec, board_sets
+from sfm_audit.audit.simulate.lidar_scan import LidarSpec, scan
 
 SPEC = BoardSpec()
 

@@ -10,9 +10,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 SMALL = SceneSpec(num_images=10, points_per_image=250, max_track_length=10, noise=NoiseSpec(sigma_px=0.0))
 SYSTEMATIC = [kind for kind in DefectKind if kind not in {DefectKind.FEW_POINTS, DefectKind.PERTURBED_POSE}]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from audit.simulate.adjust import adjust_scene, residuals_px
-from audit.simulate.demo import demo_scene, truth_records
-from audit.simulate.scene import simulate_scene
+from sfm_audit.audit.simulate.adjust import adjust_scene, residuals_px
+from sfm_audit.audit.simulate.demo import demo_scene, truth_records
+from sfm_audit.audit.simulate.scene import simulate_scene
 
 
 @pytest.fixture(scope="module", params=[0, 1])

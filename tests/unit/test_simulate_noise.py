@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
+from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
 
 NUM = 200_000
 TRACKS = np.repeat(np.arange(NUM // 5), 5)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit.calibrate.camera import Distortion
-from audit.simulate.board import BoardPose, BoardSpec, _place
-from audit.simulate.render import BoardPainter, DetectorError, PhotoSpec, detect_corners
+from sfm_audit.audit.calibrate.camera import Distortion
+from sfm_audit.audit.simulate.board import BoardPose, BoardSpec, _place
+from sfm_audit.audit.simulate.render import BoardPainter, DetectorError, PhotoSpec, detect_corners
 
 SPEC = BoardSpec()
 NO_NOISE = PhotoSpec(noise_grey=0.0)

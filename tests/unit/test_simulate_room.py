@@ -10,8 +10,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
-from audit.simulate.lidar_scan import LidarSpec
-from audit.simulate.room import ROOM_CAMERAS, RoomSpec, room_sets, zhang_views
+from sfm_audit.audit.simulate.lidar_scan import LidarSpec
+from sfm_audit.audit.simulate.room import ROOM_CAMERAS, RoomSpec, room_sets, zhang_views
 
 CAMERAS = list(ROOM_CAMERAS)
 

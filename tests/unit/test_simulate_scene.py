@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from audit.simulate.defects import CORNERS, DefectKind, DefectSpec
-from audit.simulate.layout import _choose
-from audit.simulate.noise import NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.defects import CORNERS, DefectKind, DefectSpec
+from sfm_audit.audit.simulate.layout import _choose
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 
 SMALL = SceneSpec(num_images=12, points_per_image=200, max_track_length=12)
 QUIET = dataclasses.replace(SMALL, noise=NoiseSpec(sigma_px=0.0))

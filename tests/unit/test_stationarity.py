@@ -7,13 +7,13 @@ import pycolmap
 import pytest
 from numpy.testing import assert_allclose
 
-from audit import ModelAuditor
-from audit.cameras import project, project_with_jacobians
-from audit.simulate.adjust import adjust_scene, sparse_model
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
-from audit.stationarity import pose_columns, pose_offset_px
-from loaders.camera_models import BY_NAME
+from sfm_audit.audit import ModelAuditor
+from sfm_audit.audit.cameras import project, project_with_jacobians
+from sfm_audit.audit.inliers.stationarity import pose_columns, pose_offset_px
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders.camera_models import BY_NAME
 
 CAMERA, PARAMS = BY_NAME["SIMPLE_RADIAL"], np.array([1000.0, 800.0, 600.0, -0.05])
 

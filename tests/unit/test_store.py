@@ -10,13 +10,13 @@ import pyarrow as pa
 import pytest
 from run_samples import STATE, make_ref, part_times, sample_tables, settings
 
-from audit.config import AuditConfig
-from loaders.input_state import InputState
-from reports import disk
-from reports import store as store_module
-from reports.errors import OutputError, RunFolderError
-from reports.reader import RunReader
-from reports.store import RunStore
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.loaders.datasets.input_state import InputState
+from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.run_folder import disk
+from sfm_audit.reports.run_folder import store as store_module
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
 
 A = make_ref("data/a/sparse/0")
 B = make_ref("data/b/sparse/0", scene="b")

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from run_samples import STATE, make_ref, sample_tables, settings
 
-from audit.verdict import ReasonCode, Verdict
-from loaders.model import Finding, FindingCode
-from reports.drawing import Page
-from reports.reader import RunReader
-from reports.reasons import is_remark
-from reports.store import RunStore
-from reports.summary import CAVEATS, MAX_IMAGES_OF_ONE, MAX_MODELS, render_summary
-from reports.wording import natural_key, number, plain, probability, px, shorten
+from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
+from sfm_audit.loaders.model import Finding, FindingCode
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
+from sfm_audit.reports.text.drawing import Page
+from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.reports.text.summary import CAVEATS, MAX_IMAGES_OF_ONE, MAX_MODELS, render_summary
+from sfm_audit.reports.text.wording import natural_key, number, plain, probability, px, shorten
 
 NASTY = [
     "<script>alert(1)</script>.jpg",

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_samples import sample_table
 
-from audit.table import CAMERAS, IMAGES, MODELS, OBSERVATIONS, TABLES, build_table, empty_table, schema
-from loaders.model import Finding, FindingCode
+from sfm_audit.audit.table import CAMERAS, IMAGES, MODELS, OBSERVATIONS, TABLES, build_table, empty_table, schema
+from sfm_audit.loaders.model import Finding, FindingCode
 
 GROUPS = ("radial", "tangential", "affine", "principal_point", "rolling_shutter", "smooth")
 MISFIT = " ".join(f"misfit_{group}_{what}" for group in GROUPS for what in ("p", "px", "rank"))

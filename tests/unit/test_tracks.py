@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from audit.noise import fit_variance
-from audit.tracks import track_statistics
+from sfm_audit.audit.noise.fits import fit_variance
+from sfm_audit.audit.noise.tracks import track_statistics
 
 
 def random_tracks(rng, lengths, scale=1.0):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from audit.calibrate.estimate import Degeneracy, DegenerateInputError
-from audit.calibrate.zhang import MODELS, zhang
-from audit.simulate.room import CORNER_SD_PX, ROOM_CAMERAS, zhang_views
+from sfm_audit.audit.calibrate.estimate import Degeneracy, DegenerateInputError
+from sfm_audit.audit.calibrate.zhang import MODELS, zhang
+from sfm_audit.audit.simulate.room import CORNER_SD_PX, ROOM_CAMERAS, zhang_views
 
 
 @pytest.fixture(scope="module", params=list(ROOM_CAMERAS))

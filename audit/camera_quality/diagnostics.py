@@ -1,0 +1,96 @@
+"""What do the inliers of one image say about its camera, the points taken as given? (method.md sections 5 and 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
+from sfm_audit.audit.camera_quality.expected_error import expected_error_map, grid_rays, median_depth
+from sfm_audit.audit.camera_quality.identifiability import Identifiability, identifiability
+from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, camera_plausibility
+from sfm_audit.audit.misfit import (
+    MisfitTests,
+    candidate_fields,
+    coincident_keypoints,
+    nuisance_columns,
+    prepare,
+    project_image,
+)
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import CameraRecord
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraShape:
+    """What depends on the camera alone: compute it once where images share a camera.
+
+    rays: (256, 3) unit rays of a 16 x 16 grid over the image, for the expected measurement error.
+    """
+
+    camera: CameraRecord
+    plausibility: CameraPlausibility
+    rays: FloatArray
+
+    @classmethod
+    def of(cls, camera: CameraRecord) -> CameraShape | None:
+        """Measure a camera; None where its parameters are not finite."""
+        if not np.isfinite(camera.params).all():
+            return None
+        return cls(camera, camera_plausibility(camera), grid_rays(camera))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFacts:
+    """One image's evidence on its camera; misfit as the model stands, expected_error_px median over the image."""
+
+    shape: CameraShape
+    misfit: MisfitTests
+    identifiability: Identifiability
+    expected_error_px: float
+    coverage: float
+    occupied_cells: int
+
+
+def camera_facts(
+    shape: CameraShape,
+    xy_px: FloatArray,
+    xyz_cam: FloatArray,
+    residuals_px: FloatArray,
+    sigma_px: float,
+    grid: int,
+) -> CameraFacts | None:
+    """Ask everything that needs the Jacobian of the image's own parameters, which is built once.
+
+    Parameters
+    ----------
+    shape : of the image's camera            xy_px : (n, 2) observed inliers          xyz_cam : (n, 3), camera frame
+    residuals_px : (2, n) observed - projected           sigma_px : sigma_constant_px         grid : of occupied_cells
+
+    Returns
+    -------
+    CameraFacts
+        None without inliers.
+    """
+    if not len(xyz_cam):
+        return None
+    camera = shape.camera
+    projected = project_image(camera, xyz_cam)
+    columns = nuisance_columns(camera.model, projected)
+    known = identifiability(camera, columns, sigma_px)
+    depth = median_depth(camera, xyz_cam)
+    error = math.nan
+    if math.isfinite(sigma_px) and not known.parameters.is_singular:
+        error = expected_error_map(camera, known.parameters, sigma_px, depth, rays=shape.rays).median_px
+    fields = candidate_fields(camera, projected)
+    prepared = prepare(columns, fields, clusters=coincident_keypoints(xy_px), overwrite_fields=True)
+    return CameraFacts(
+        shape,
+        prepared.test(residuals_px),
+        known,
+        error,
+        coverage(xy_px, camera.width, camera.height),
+        occupied_cells(xy_px, camera.width, camera.height, grid),
+    )

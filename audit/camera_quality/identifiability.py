@@ -1,0 +1,175 @@
+"""How well do the image's own observations pin down its camera? (method.md section 6).
+
+Everything here is *conditional on the points*: the 3D points are taken as known exactly. In a reconstruction they are
+not, so these standard deviations are lower bounds (about 2.7 times too small in the focal length, method.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
+from sfm_audit.loaders.model import CameraRecord
+
+POSE_NAMES: Final = ("rotation_x", "rotation_y", "rotation_z", "translation_x", "translation_y", "translation_z")
+SINGULAR: Final = 1e-9
+"""Share of the largest singular value (columns of unit length) at or below which nothing is identified."""
+_SMALLEST_PIVOT: Final = 1e-10  # of the Gram matrix of unit columns: below it the singular values are taken exactly
+
+
+def fitted_names(model: CameraModel) -> tuple[str, ...]:
+    """Names of the columns of method.md section 5's N: the pose, then all intrinsics but the principal point.
+
+    Rotations in rad, translations in model units, both applied in the camera frame; spherical models: the pose only.
+    """
+    if model.is_spherical:
+        return POSE_NAMES
+    fixed = {model.param_names[i] for i in model.principal_point_idxs}
+    return POSE_NAMES + tuple(name for name in model.param_names if name not in fixed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterCovariance:
+    """Covariance of q fitted parameters, conditional on the points.
+
+    names: (q,) the parameters; those without any effect on the observations (zero columns) are not among them.
+    covariance: (q, q) in the units of the parameters; NaN where the parameters cannot be told apart or the noise is
+    unknown.    singular_share: smallest / largest singular value of the unit columns; NaN without columns.
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+    singular_share: float
+
+    @property
+    def is_singular(self) -> bool:
+        """Whether some combination of the parameters leaves all predictions where they are."""
+        return self.singular_share <= SINGULAR
+
+    @property
+    def sd(self) -> FloatArray:
+        """(q,) standard deviations."""
+        return np.sqrt(self.covariance.diagonal())
+
+    @property
+    def correlation(self) -> FloatArray:
+        """(q, q) correlation matrix, 1 on the diagonal; NaN where the covariance is."""
+        sd = self.sd
+        return self.covariance / (sd[:, None] * sd)
+
+    def sd_of(self, name: str) -> float:
+        """Standard deviation of one parameter; NaN when it has no effect on the observations."""
+        return float(self.sd[self.names.index(name)]) if name in self.names else math.nan
+
+
+def parameter_covariance(columns: FloatArray, names: tuple[str, ...], sigma_px: float) -> ParameterCovariance:
+    """Return (N^T W N)^-1 with W = 1 / sigma^2, conditional on the points.
+
+    Parameters
+    ----------
+    columns : (q, 2, n) or (q, m)    N, px per unit of each parameter, as of ``audit.misfit.nuisance``
+    names : (q,)                     what the columns are, see `fitted_names`
+    sigma_px : noise per axis, px: sigma_constant_px, of all inliers
+
+    Raises
+    ------
+    ValueError
+        when names and columns differ in number.
+
+    Notes
+    -----
+    method.md section 6. Zero columns are dropped, the others scaled to unit length. The Gram matrix decides where its
+    smallest Cholesky pivot is well above rounding; elsewhere the singular values come from the columns themselves.
+    Derivatives that are not finite, or no observations, leave everything NaN.
+    """
+    flat = columns.reshape(len(columns), -1)
+    if len(names) != len(flat):
+        raise ValueError(f"{len(flat)} columns but {len(names)} names")
+    with np.errstate(over="ignore", invalid="ignore"):
+        norms = np.sqrt(np.einsum("cm,cm->c", flat, flat))
+    used = np.flatnonzero(norms != 0.0)
+    if used.size < len(flat):
+        flat, norms, names = flat[used], norms[used], tuple(names[i] for i in used)
+    if not names or not np.isfinite(norms).all():
+        return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), math.nan)
+    inverse_root, share = _inverse_root(flat / norms[:, None])
+    if share <= SINGULAR:
+        return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), share)
+    inverse_root *= sigma_px / norms[:, None]
+    return ParameterCovariance(names, inverse_root @ inverse_root.T, share)
+
+
+def _inverse_root(unit: FloatArray) -> tuple[FloatArray, float]:
+    """Return R, (q, q), with R R^T = (U U^T)^-1 for unit columns U (q, m), and smallest / largest singular value."""
+    if unit.shape[0] > unit.shape[1]:
+        return np.full((len(unit),) * 2, np.nan), 0.0
+    values, vectors = np.linalg.eigh(unit @ unit.T)
+    if values[0] <= _SMALLEST_PIVOT * values[-1]:
+        triangle = np.linalg.qr(unit.T, mode="r")
+        _, singular, rows = np.linalg.svd(triangle)
+        values, vectors = singular[::-1] ** 2, rows[::-1].T
+    share = math.sqrt(max(float(values[0] / values[-1]), 0.0))
+    if share <= SINGULAR:
+        return np.full_like(vectors, np.nan), share
+    return np.asarray(vectors / np.sqrt(values)), share
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identifiability:
+    """What the observations of an image say about its intrinsics, conditional on the points.
+
+    parameters: all fitted parameters with their covariance.
+    sd_focal_px: of the first focal length, px.    sd_focal_rel: largest sd_f / |f|.
+    sd_k1: of the first distortion parameter.    k1: its value.    NaN where the camera has none, or where singular.
+    has_focal, has_k1: whether the camera has such a parameter (panoramas have no focal length).
+    """
+
+    parameters: ParameterCovariance
+    sd_focal_px: float
+    sd_focal_rel: float
+    sd_k1: float
+    k1: float
+    has_focal: bool
+    has_k1: bool
+
+    def k1_identified(self, num_sds: float = 2.0) -> bool | None:
+        """Whether |k1| is at least ``num_sds`` of its standard deviations; None for cameras without distortion.
+
+        The first distortion parameter is meant, whatever it is called (k, k1, k0, omega, alpha). Where its standard
+        deviation is unknown (no effect on any observation, or singular) it is not identified.
+        """
+        return abs(self.k1) >= num_sds * self.sd_k1 if self.has_k1 else None
+
+
+def identifiability(camera: CameraRecord, columns: FloatArray, sigma_px: float) -> Identifiability:
+    """Summarise the covariance of an image's camera parameters, conditional on the points.
+
+    Parameters
+    ----------
+    camera : the camera of the image
+    columns : (6 + k, 2, n) or (6 + k, m)    N of `fitted_names`, px per unit
+    sigma_px : sigma_constant_px, px
+
+    Notes
+    -----
+    method.md section 6; of a camera shared by many images this is what *one* image says.
+    """
+    model, params = camera.model, camera.params
+    parameters = parameter_covariance(columns, fitted_names(model), sigma_px)
+    focals = [(parameters.sd_of(model.param_names[i]), float(params[i])) for i in model.focal_idxs]
+    relative = [sd / abs(focal) if focal else math.nan for sd, focal in focals]
+    extra = model.extra_idxs
+    return Identifiability(
+        parameters,
+        focals[0][0] if focals else math.nan,
+        float(np.max(relative)) if relative else math.nan,
+        parameters.sd_of(model.param_names[extra[0]]) if extra else math.nan,
+        float(params[extra[0]]) if extra else math.nan,
+        has_focal=bool(focals),
+        has_k1=bool(extra),
+    )

@@ -1,0 +1,176 @@
+"""One camera, all its images: the misfit tests pooled (method.md section 5, cameras)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_audit.audit.camera_quality.diagnostics import CameraFacts
+from sfm_audit.audit.decision.misfit import Misfit, find_misfit
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.misfit import (
+    ImageDesign,
+    MisfitTests,
+    PooledTests,
+    Retest,
+    advised_camera_model,
+    camera_tests,
+    image_design,
+    image_retest,
+)
+from sfm_audit.audit.misfit.peeling import Significance
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, SparseModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraAudit:
+    """What all images of a camera say about it.
+
+    image_idxs: (k,) its images with inliers.        num_points, num_observations: 3D points and inliers behind it.
+    """
+
+    camera: CameraRecord
+    image_idxs: IntArray
+    num_points: int
+    num_observations: int
+    misfit: Misfit
+    advised_camera_model: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CameraImages:
+    """The images of one camera with inliers, and the rows of their tracks, numbered from 0."""
+
+    model: SparseModel
+    residuals: ModelResiduals
+    camera: CameraRecord
+    image_idxs: IntArray
+
+    def tests(self, camera: CameraRecord, tracks: Sequence[IntArray], num_tracks: int) -> PooledTests:
+        """Test as if the images had been taken with ``camera``."""
+
+        def design(k: int) -> ImageDesign:
+            xyz_cam, residuals_px = self.geometry(k)
+            return image_design(camera, xyz_cam, residuals_px, tracks[k])
+
+        return camera_tests(design, len(self.image_idxs), num_tracks)
+
+    def geometry(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Inlier points (n, 3) in the camera frame and residuals (2, n) of the k-th image."""
+        image_idx = int(self.image_idxs[k])
+        rows = self.residuals.rows(image_idx)
+        xyz_world = self.model.points.xyz_world[self.residuals.point_idx[rows]]
+        return self.model.image(image_idx).cam_from_world(xyz_world), self.residuals.residuals_px[:, rows]
+
+    def tracks(self) -> tuple[list[IntArray], int]:
+        """Rows of each image's points in the list of this camera's points, and the length of that list."""
+        parts = [self.residuals.point_idx[self.residuals.rows(int(i))] for i in self.image_idxs]
+        distinct, row = np.unique(np.concatenate(parts), return_inverse=True)
+        ends = np.cumsum([part.size for part in parts])[:-1]
+        return [part.astype(np.int64) for part in np.split(row, ends)], distinct.size
+
+
+def audit_cameras(
+    model: SparseModel,
+    residuals: ModelResiduals,
+    facts: Sequence[CameraFacts | None],
+    sigma_px: FloatArray,
+    *,
+    alpha: float,
+    tau_px: FloatArray,
+) -> list[CameraAudit]:
+    """Audit every camera that has an image with inliers, in the order of the camera table.
+
+    Parameters
+    ----------
+    facts : per image, None without inliers            sigma_px, tau_px : (I,) sigma_constant_px and materiality
+
+    Notes
+    -----
+    Poses are profiled per image, intrinsics once, observations of one track count as one. A camera with a single image
+    has that image's tests: Hotelling's law holds for few observations too, and clustering by track changes nothing
+    there but for points that the image sees twice. q: Benjamini-Hochberg over the model's cameras.
+    """
+    audited = np.array([i for i, fact in enumerate(facts) if fact is not None], dtype=np.int64)
+    cameras = np.unique(model.images.camera_idx[audited])
+    groups = [
+        _CameraImages(model, residuals, model.camera(int(c)), audited[model.images.camera_idx[audited] == c])
+        for c in cameras
+    ]
+    tracks = [group.tracks() for group in groups]
+    tests = [
+        own.misfit
+        if len(group.image_idxs) == 1 and (own := facts[int(group.image_idxs[0])]) is not None
+        else group.tests(group.camera, *track).tests
+        for group, track in zip(groups, tracks, strict=True)
+    ]
+    significance = Significance.of(tests)
+    out = []
+    for k, (group, (rows, num_points)) in enumerate(zip(groups, tracks, strict=True)):
+        num_observations = sum(part.size for part in rows)
+        sigma, tau = float(np.median(sigma_px[group.image_idxs])), float(np.median(tau_px[group.image_idxs]))
+        misfit = find_misfit(
+            tests[k],
+            significance.q[k],
+            num_observations=num_observations,
+            sigma_px=sigma,
+            alpha=alpha,
+            tau_px=tau,
+        )
+        advice = advised_camera_model(
+            group.camera,
+            misfit.group if misfit.material else None,
+            misfit.material,
+            retest=_retest(group, rows, num_points),
+            distortion_identified=_distortion_identified([facts[int(i)] for i in group.image_idxs]),
+            alpha=alpha,
+            tau_px=tau,
+        )
+        out.append(CameraAudit(group.camera, group.image_idxs, num_points, num_observations, misfit, advice))
+    return out
+
+
+def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> Retest:
+    """The geometry waits until it is asked, which happens to few cameras."""
+
+    def retest(camera: CameraRecord) -> MisfitTests:
+        if len(group.image_idxs) == 1:
+            return image_retest(*group.geometry(0))(camera)
+        return group.tests(camera, rows, num_points).tests
+
+    return retest
+
+
+def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float = 2.0) -> bool:
+    """Whether some distortion parameter differs from 0 by two standard deviations, the images' information summed.
+
+    Each image's information is taken after its own pose and focal length were profiled, so the sum is a little low.
+    """
+    known = [fact for fact in facts if fact is not None]
+    if not known or not known[0].shape.camera.model.extra_idxs:
+        return True
+    camera = known[0].shape.camera
+    for idx in camera.model.extra_idxs:
+        sds = np.array([fact.identifiability.parameters.sd_of(camera.model.param_names[idx]) for fact in known])
+        sds = sds[np.isfinite(sds) & (sds > 0)]
+        information = float((sds**-2.0).sum())
+        if information > 0 and abs(camera.params[idx]) >= min_sds / math.sqrt(information):
+            return True
+    return False
+
+
+def image_advice(fact: CameraFacts, misfit: Misfit, retest: Retest, *, alpha: float, tau_px: float) -> str | None:
+    """Return the camera model that one image asks for; ``retest`` of its points and residuals."""
+    return advised_camera_model(
+        fact.shape.camera,
+        misfit.group if misfit.material else None,
+        misfit.material,
+        retest=retest,
+        distortion_identified=_distortion_identified([fact]),
+        alpha=alpha,
+        tau_px=tau_px,
+    )

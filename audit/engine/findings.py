@@ -1,0 +1,37 @@
+"""What do the residuals of a model say against it as a whole? Findings beside those of the loaders."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from sfm_audit.audit.inliers.stored_errors import StoredErrors, stale_finding
+from sfm_audit.audit.noise.standardise import ModelTracks
+from sfm_audit.loaders.model import Finding, FindingCode
+
+_REMOVABLE_SHARE: Final = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
+
+
+def residual_findings(stored: StoredErrors, tracks: ModelTracks, num_points: int, num_exact: int) -> list[Finding]:
+    """Return the findings that need residuals.
+
+    Parameters
+    ----------
+    stored : stored point errors beside recomputed ones          tracks : of all inliers of the model
+    num_points : 3D points          num_exact : images whose 2D points are projections, not measurements
+    """
+    statistics = tracks.statistics
+    found = [stale_finding(stored)]
+    if num_exact:
+        text = f"the 2D points of {num_exact} images are projections of the 3D points, not measurements"
+        found.append(Finding(FindingCode.EXACT_PROJECTIONS, num_exact, text))
+    elif statistics.removable_sq_px2 > _REMOVABLE_SHARE * statistics.total_sq_px2:
+        share = statistics.removable_sq_px2 / statistics.total_sq_px2
+        text = f"3D points are not at their optimum: moving them alone removes {share:.1%} of the squared residuals"
+        found.append(Finding(FindingCode.POINTS_NOT_OPTIMAL, num_points, text))
+    if tracks.too_many_nonstationary:
+        count = int(np.count_nonzero(tracks.nonstationary))
+        text = f"{count} images are not at the optimum of their poses, too many to leave out of the track statistics"
+        found.append(Finding(FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES, count, text))
+    return [finding for finding in found if finding is not None]

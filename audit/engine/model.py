@@ -1,0 +1,381 @@
+"""One model in, its tables out: the order in which the questions are asked (method.md, in the order data meets it)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import pyarrow as pa
+from threadpoolctl import threadpool_limits
+
+from sfm_audit.audit.camera_quality.diagnostics import CameraFacts, CameraShape, camera_facts
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.misfit import shared_camera_reason
+from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode
+from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras
+from sfm_audit.audit.engine.findings import residual_findings
+from sfm_audit.audit.engine.image import CameraOpinion, ImageAudit, Judgements, judged, opinion_of
+from sfm_audit.audit.engine.observations import observation_table
+from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
+from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
+from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
+from sfm_audit.audit.misfit import MisfitTests, image_retest
+from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
+from sfm_audit.audit.misfit.peeling import UNTESTED, Blame, Peeling
+from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
+from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
+from sfm_audit.audit.table import ModelLabels, TableName, build_table, empty_table, schema
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
+
+T = TypeVar("T")
+
+
+class Spread(Protocol):
+    """Runs a function of an auditor and a range of images over all its images; answers in the images' order."""
+
+    def __call__(self, function: Callable[[ModelAuditor, range], list[T]], auditor: ModelAuditor) -> list[T]:
+        """Return what the function says about each image."""
+        ...
+
+
+def in_turn(function: Callable[[ModelAuditor, range], list[T]], auditor: ModelAuditor) -> list[T]:
+    """One image after the other, in this process."""
+    return function(auditor, range(len(auditor.model.images)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelAudit:
+    """The tables of one model, as written to a run folder: a row per image, per camera, per model.
+
+    observations: a row per inlier; None unless it was asked for.
+    """
+
+    images: pa.Table
+    cameras: pa.Table
+    models: pa.Table
+    observations: pa.Table | None = None
+
+    @property
+    def tables(self) -> dict[str, pa.Table]:
+        """The tables by name."""
+        tables = {"images": self.images, "cameras": self.cameras, "models": self.models}
+        return tables if self.observations is None else {**tables, "observations": self.observations}
+
+
+class ModelAuditor:
+    """What the images of one model share, computed once and in file order, and each image's audit on top of it.
+
+    Parameters
+    ----------
+    model : from `loaders.open_model`
+    config : noise model and thresholds; the defaults when None
+    keypoint_scale_px : (M,) size of the keypoint of each row of ``model.observations``, NaN where unknown; needed by
+        the noise model ``keypoint`` alone (`loaders.colmap.database`)
+    spread : where the stages run that look at one image at a time; the numbers do not depend on it
+    """
+
+    def __init__(
+        self,
+        model: SparseModel,
+        config: AuditConfig | None = None,
+        keypoint_scale_px: FloatArray | None = None,
+        *,
+        spread: Spread = in_turn,
+    ) -> None:
+        self.model = model
+        self._spread = spread
+        self.config = config or AuditConfig()
+        self._keypoint_scale_px = keypoint_scale_px
+        if self.config.noise == "keypoint" and keypoint_scale_px is None:
+            raise ValueError("the noise model keypoint needs keypoint_scale_px")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out where images are audited: who receives an auditor audits them himself."""
+        return {**self.__dict__, "_spread": in_turn}
+
+    @cached_property
+    def residuals(self) -> ModelResiduals:
+        """All inliers of the model, projected."""
+        return model_residuals(self.model)
+
+    @cached_property
+    def tracks(self) -> ModelTracks:
+        """Whitened residuals, track variances and the prior of the ``track`` noise model."""
+        return model_tracks(
+            self.residuals,
+            len(self.model.points),
+            pose_offset_threshold_px=self.config.pose_offset_threshold_px,
+            min_track_length=self.config.min_track_length,
+            min_eigenvalue=self.config.min_track_eigenvalue,
+        )
+
+    @cached_property
+    def keypoint_tracks(self) -> KeypointTracks:
+        """Tracks weighted by the size of keypoints, for the ``keypoint`` noise model."""
+        if self._keypoint_scale_px is None:
+            raise ValueError("the noise model keypoint needs keypoint_scale_px")
+        return keypoint_tracks(
+            self.residuals,
+            len(self.model.points),
+            self._keypoint_scale_px[self.residuals.observation_row],
+            pose_offset_threshold_px=self.config.pose_offset_threshold_px,
+            min_track_length=self.config.min_track_length,
+            min_eigenvalue=self.config.min_track_eigenvalue,
+        )
+
+    @cached_property
+    def sigma_constant_px(self) -> FloatArray:
+        """Robust sd per axis of each image's raw residuals (I,), NaN where undetermined."""
+        variances = [
+            fit_constant_variance(self.residuals.residuals_px[:, self.residuals.rows(i)] ** 2).detector_px2
+            for i in range(len(self.model.images))
+        ]
+        return np.sqrt(np.array(variances, dtype=np.float64))
+
+    @cached_property
+    def tau_px(self) -> FloatArray:
+        """Materiality of a misfit in each image (I,), px; NaN where the noise is unknown and tau is in sigma."""
+        return np.array([self.config.tau_px(float(sigma)) for sigma in self.sigma_constant_px], dtype=np.float64)
+
+    @cached_property
+    def facts(self) -> tuple[CameraFacts | None, ...]:
+        """Each image's evidence on its camera as the model stands; None without inliers."""
+        _ = self.sigma_constant_px  # with the residuals, what the images share
+        return tuple(self._spread(_facts_of, self))
+
+    @cached_property
+    def blame(self) -> Blame:
+        """Misfit of all images, as the model stands and after the images at fault were peeled off."""
+        tests = [fact.misfit if fact else UNTESTED for fact in self.facts]
+        if self.config.points == "independent":
+            return Blame.of_nobody(tests, self.residuals, most_are_wrong=False)
+        excluded = self.residuals.pose_offset_px > self.config.pose_offset_threshold_px
+        if 2 * np.count_nonzero(excluded) > np.count_nonzero(np.diff(self.residuals.offsets)):
+            excluded = np.zeros_like(excluded)
+        peeling = Peeling(self.model, self.residuals, excluded, alpha=self.config.alpha, tau_px=self.tau_px)
+        return peeling.run(tests)
+
+    @cached_property
+    def cameras(self) -> list[CameraAudit]:
+        """Every camera that has an image with inliers."""
+        return audit_cameras(
+            self.model,
+            self.residuals,
+            self.facts,
+            self.sigma_constant_px,
+            alpha=self.config.alpha,
+            tau_px=self.tau_px,
+        )
+
+    def _xyz_cam(self, image_idx: int) -> FloatArray:
+        point_idx = self.residuals.point_idx[self.residuals.rows(image_idx)]
+        return self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(point_idx, axis=0))
+
+    def opinion(self, image_idx: int) -> CameraOpinion | None:
+        """What was decided about the camera of the image in row ``image_idx``; None without inliers."""
+        fact = self.facts[image_idx]
+        if fact is None:
+            return None
+        clean = self.blame.clean[self.residuals.rows(image_idx)]
+        opinion = opinion_of(
+            fact,
+            self.blame.final_tests[image_idx],
+            self.blame.final.q[image_idx],
+            int(np.count_nonzero(clean)),
+            partial(self._retest, image_idx),
+            float(self.sigma_constant_px[image_idx]),
+            self.config,
+        )
+        return replace(opinion, shared=self._shared_fault(image_idx)) if self.blame.most_are_wrong else opinion
+
+    def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
+        """The final tests of the image if it had been fitted with this camera, to first order."""
+        rows = self.residuals.rows(image_idx)
+        used = np.flatnonzero(self.blame.clean[rows])
+        residuals_px = self.blame.residuals_px[:, rows].take(used, axis=1)
+        return image_retest(self._xyz_cam(image_idx)[used], residuals_px)(camera)
+
+    def _shared_fault(self, image_idx: int) -> Reason | None:
+        """The reason that the image's camera as a whole is at fault, if several images share it and together say so."""
+        camera_id = int(self.model.images.camera_id[image_idx])
+        camera = next((c for c in self.cameras if c.camera.camera_id == camera_id), None)
+        if camera is None or len(camera.image_idxs) < 2 or not camera.misfit.material:
+            return None
+        return shared_camera_reason(camera_id, len(camera.image_idxs), camera.misfit)
+
+    @cached_property
+    def stored_errors(self) -> StoredErrors:
+        """The stored point errors beside recomputed ones."""
+        return compare_stored_errors(self.model, self.residuals)
+
+    def inliers(self, image: int | str) -> InlierSet:
+        """Return the 2D-3D inliers of an image, given its row, its name or ``id:<image_id>``."""
+        image_idx = self.model.image_idx(image) if isinstance(image, str) else image
+        residuals, observations = self.residuals, self.model.observations
+        row = residuals.observation_row[residuals.rows(image_idx)]
+        point_idx = observations.point_idx[row]
+        return InlierSet(
+            self.model.image(image_idx),
+            observations.xy_px.take(row, axis=0),
+            self.model.points.xyz_world.take(point_idx, axis=0),
+            point_idx,
+            num_dangling=int(residuals.num_dangling[image_idx]),
+            num_behind=int(residuals.num_behind[image_idx]),
+            num_nonfinite=int(residuals.num_nonfinite[image_idx]),
+        )
+
+    def image(self, image: int | str) -> ImageAudit:
+        """Audit one image within its model, given its row, its name or ``id:<image_id>``."""
+        image_idx = self.model.image_idx(image) if isinstance(image, str) else image
+        rows = self.residuals.rows(image_idx)
+        residuals_px = self.residuals.residuals_px[:, rows]
+        constant = constant_noise(residuals_px)
+        return judged(
+            self.inliers(image_idx),
+            residuals_px,
+            float(self.residuals.pose_offset_px[image_idx]),
+            constant,
+            self._noise(image_idx, constant),
+            self.tracks.statistics.track_length[rows],
+            self.facts[image_idx],
+            self.opinion(image_idx),
+            self.config,
+        )
+
+    def _noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
+        """The image's noise under the chosen model."""
+        match self.config.noise:
+            case "constant":
+                return constant
+            case "track":
+                return track_noise(self.tracks, image_idx, constant.sigma_constant_px)
+            case "keypoint":
+                return keypoint_noise(self.keypoint_tracks, self.tracks, image_idx, constant.sigma_constant_px)
+
+    def standardised(self, image_idx: int) -> tuple[IntArray, FloatArray]:
+        """Return which of the image's inliers (m,) the noise model standardises, and their z (m, 2)."""
+        rows = self.residuals.rows(image_idx)
+        noise = self._noise(image_idx, constant_noise(self.residuals.residuals_px[:, rows]))
+        match self.config.noise:
+            case "constant":
+                used = np.arange(rows.stop - rows.start)
+            case "track":
+                used = np.flatnonzero(self.tracks.statistics.verified[rows])
+            case "keypoint":
+                offsets, verified = self.keypoint_tracks.tracks.offsets, self.keypoint_tracks.tracks.statistics.verified
+                known = np.flatnonzero(self.keypoint_tracks.known[rows])
+                used = known[verified[int(offsets[image_idx]) : int(offsets[image_idx + 1])]]
+        return used, noise.z
+
+    def observations(self, labels: ModelLabels | None = None) -> pa.Table:
+        """Return what is left of every inlier: the table ``observations``, one row each."""
+        length = self.tracks.statistics.track_length
+        return observation_table(self.model, self.residuals, length, self.standardised, labels or self._own_labels)
+
+    @property
+    def _own_labels(self) -> ModelLabels:
+        return ModelLabels("", "", "0", self.model.location)
+
+    def tables(self, labels: ModelLabels | None = None, *, observations: bool = False) -> ModelAudit:
+        """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
+        labels = labels or self._own_labels
+        _ = self.blame, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks  # shared
+        images = self._spread(partial(_images_of, labels=labels), self)
+        rows = [row for row, _ in images]
+        judgements = [judgement for _, judgement in images]
+        num_exact = sum(
+            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in members.ks.reasons)
+            for _, members in judgements
+        )
+        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
+        findings = [*self.model.findings, *own_findings]
+        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, judgements)
+        return ModelAudit(
+            _images_table(rows),
+            _table("cameras", [camera_row(camera, labels) for camera in self.cameras]),
+            _table("models", [row]),
+            self.observations(labels) if observations else None,
+        )
+
+
+def audit_model(
+    model: SparseModel,
+    config: AuditConfig | None = None,
+    labels: ModelLabels | None = None,
+    keypoint_scale_px: FloatArray | None = None,
+    *,
+    observations: bool = False,
+    spread: Spread = in_turn,
+) -> ModelAudit:
+    """Audit all images of a model.
+
+    Parameters
+    ----------
+    model : from `loaders.open_model`
+    config : noise model and thresholds; the defaults when None
+    labels : the text columns that name the model in a dataset
+    keypoint_scale_px : see `ModelAuditor`
+    observations : whether to make the table of observations too, one row per inlier
+    spread : see `ModelAuditor`
+
+    Returns
+    -------
+    ModelAudit
+        Arrow tables; ``.images.to_pandas()`` for a data frame. Columns, units, meanings: docs/tables.md.
+    """
+    # Matrices are small here: a second BLAS thread only waits for the first, and on a busy machine that costs 10 x.
+    with threadpool_limits(limits=1, user_api="blas"):
+        auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread)
+        return auditor.tables(labels, observations=observations)
+
+
+def _facts_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraFacts | None]:
+    """Evidence on the cameras of some images; what depends on a camera alone is computed once for them."""
+    model, residuals = auditor.model, auditor.residuals
+    shapes: dict[int, CameraShape | None] = {}
+    out: list[CameraFacts | None] = []
+    for image_idx in image_idxs:
+        camera_idx = int(model.images.camera_idx[image_idx])
+        rows = residuals.rows(image_idx)
+        if rows.start == rows.stop:
+            out.append(None)
+            continue
+        if camera_idx not in shapes:
+            shapes[camera_idx] = CameraShape.of(model.camera(camera_idx))
+        shape = shapes[camera_idx]
+        if shape is None:
+            out.append(None)
+            continue
+        xy_px = model.observations.xy_px.take(residuals.observation_row[rows], axis=0)
+        xyz_cam = model.image(image_idx).cam_from_world(model.points.xyz_world.take(residuals.point_idx[rows], axis=0))
+        sigma_px = float(auditor.sigma_constant_px[image_idx])
+        own = residuals.residuals_px[:, rows]
+        out.append(camera_facts(shape, xy_px, xyz_cam, own, sigma_px, auditor.config.grid))
+    return out
+
+
+def _images_of(
+    auditor: ModelAuditor, image_idxs: range, labels: ModelLabels
+) -> list[tuple[Row, tuple[Judgement, Judgements]]]:
+    """Rows of the image table and judgements of some images."""
+    audits = map(auditor.image, image_idxs)
+    return [(image_row(audit, labels, auditor.config.noise), (audit.judgement, audit.judgements)) for audit in audits]
+
+
+def _images_table(rows: Sequence[Row]) -> pa.Table:
+    if rows:
+        q = benjamini_hochberg(np.array([row["ks_p"] for row in rows], dtype=np.float64))
+        for row, value in zip(rows, q, strict=True):
+            row["ks_q"] = value
+    return _table("images", rows)
+
+
+def _table(name: TableName, rows: Sequence[Row]) -> pa.Table:
+    if not rows:
+        return empty_table(name)
+    return build_table({column: [row[column] for row in rows] for column in rows[0]}, schema(name))

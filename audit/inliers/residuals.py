@@ -1,0 +1,156 @@
+"""Which observations are inliers, and what is left of each after projection (method.md section 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_audit.audit.cameras import project_columns
+from sfm_audit.audit.inliers.stationarity import pose_offset_px
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageResiduals:
+    """The inliers among the linked points of one image, projected.
+
+    inlier_row: (n,) their rows among the points given.          residuals_px: (2, n) observed - projected.
+    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (3, n).
+    num_dangling, num_behind, num_nonfinite: points that are no inliers, by cause.
+    """
+
+    inlier_row: IntArray
+    residuals_px: FloatArray
+    jacobian_cam: FloatArray
+    xyz_cam: FloatArray
+    num_dangling: int
+    num_behind: int
+    num_nonfinite: int
+
+    @property
+    def pose_offset_px(self) -> float:
+        """RMS residual that moving the pose alone would remove (method.md section 6), NaN without inliers."""
+        return pose_offset_px(self.residuals_px, self.jacobian_cam, self.xyz_cam)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelResiduals:
+    """The inliers of all images of a model, by image in ImageTable order, then by POINTS2D order.
+
+    offsets: (I + 1,) image i owns columns offsets[i]:offsets[i + 1].    observation_row: (n,) rows of ObservationTable.
+    point_idx: (n,) rows of PointTable.                                  residuals_px: (2, n) observed - projected.
+    point_jacobian: (2, 3, n) px per model unit, world frame.            pose_offset_px: (I,) NaN without inliers.
+    num_dangling, num_behind, num_nonfinite: (I,) linked observations that are no inliers, by cause.
+    """
+
+    offsets: IntArray
+    observation_row: IntArray
+    point_idx: IntArray
+    residuals_px: FloatArray
+    point_jacobian: FloatArray
+    pose_offset_px: FloatArray
+    num_dangling: IntArray
+    num_behind: IntArray
+    num_nonfinite: IntArray
+
+    def rows(self, image_idx: int) -> slice:
+        """Columns of the image in row ``image_idx`` of the image table."""
+        return slice(int(self.offsets[image_idx]), int(self.offsets[image_idx + 1]))
+
+
+def image_residuals(
+    image: ImageRecord, xy_px: FloatArray, xyz_world: FloatArray, point_idx: IntArray
+) -> ImageResiduals:
+    """Project the linked points of one image and keep those that can be audited.
+
+    Parameters
+    ----------
+    image : pose and camera; without a camera nothing is projected and all count as not finite
+    xy_px : (m, 2) observed, distorted px        xyz_world : (m, 3), rows of dangling points are ignored
+    point_idx : (m,) rows of the point table, -1 = dangling
+
+    Notes
+    -----
+    method.md section 1: an observation enters if its point exists, Zc > 0 (spherical cameras: Xc != 0) and its
+    projection is finite. Observations that are themselves not finite count as not finite.
+    """
+    linked = point_idx >= 0
+    num_dangling = linked.size - int(np.count_nonzero(linked))
+    camera = image.camera
+    with np.errstate(all="ignore"):
+        xyz_cam = image.cam_from_world(xyz_world)
+        usable = camera is not None and bool(np.isfinite(camera.params).all())
+        finite = linked & np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1) & usable
+        spherical = camera is not None and camera.model.is_spherical
+        candidate = finite & ((xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0)
+        num_behind = int(np.count_nonzero(finite)) - int(np.count_nonzero(candidate))
+        residuals, jacobian = np.empty((2, 0)), np.empty((2, 3, 0))
+        rows = np.flatnonzero(candidate)
+        if camera is not None and rows.size:
+            all_in = rows.size == linked.size
+            xyz_cam = xyz_cam if all_in else xyz_cam[rows]
+            residuals, jacobian = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
+        valid = np.isfinite(residuals).all(axis=0)
+    if not valid.all():
+        rows, xyz_cam = rows[valid], xyz_cam[valid]
+        residuals, jacobian = residuals[:, valid], jacobian[:, :, valid]
+    num_nonfinite = linked.size - num_dangling - num_behind - rows.size
+    return ImageResiduals(
+        rows, residuals, jacobian, xyz_cam.T if rows.size else np.empty((3, 0)), num_dangling, num_behind, num_nonfinite
+    )
+
+
+def _residuals(camera: CameraRecord, xy_px: FloatArray, xyz_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Observed minus projected (2, n) and the Jacobian (2, 3, n) in the camera frame."""
+    projection = project_columns(camera.model, camera.params, xyz_cam, with_params=False)
+    residuals = np.subtract(xy_px.T, projection.xy_px, order="C")
+    if camera.model.is_spherical:
+        residuals[0] -= camera.width * np.round(residuals[0] / camera.width)  # the seam is no edge
+    return residuals, projection.d_xy_d_cam
+
+
+def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:
+    """(m, 3) world points; NaN where dangling."""
+    if not len(model.points):
+        return np.full((len(point_idx), 3), np.nan)
+    xyz = model.points.xyz_world.take(point_idx, axis=0, mode="wrap")
+    dangling: BoolArray = point_idx < 0
+    if dangling.any():
+        xyz[dangling] = np.nan
+    return xyz
+
+
+def model_residuals(model: SparseModel) -> ModelResiduals:
+    """Return the inliers of all images with their residuals; one pass over the images, arrays throughout."""
+    observations = model.observations
+    num_images, capacity = len(model.images), len(observations)
+    offsets = np.zeros(num_images + 1, dtype=np.int64)
+    observation_row = np.empty(capacity, dtype=np.int64)
+    residuals = np.empty((2, capacity))
+    jacobian = np.empty((2, 3, capacity))
+    pose_offset = np.full(num_images, np.nan)
+    counts = np.zeros((3, num_images), dtype=np.int64)
+    for image_idx in range(num_images):
+        image, linked = model.image(image_idx), slice(*observations.offsets[image_idx : image_idx + 2])
+        point_idx = observations.point_idx[linked]
+        part = image_residuals(image, observations.xy_px[linked], _points_of(model, point_idx), point_idx)
+        own = slice(offsets[image_idx], offsets[image_idx] + part.inlier_row.size)
+        offsets[image_idx + 1] = own.stop
+        np.add(part.inlier_row, linked.start, out=observation_row[own])
+        residuals[:, own] = part.residuals_px
+        jacobian[:, :, own] = image.rotation_cam_from_world.T @ part.jacobian_cam
+        pose_offset[image_idx] = part.pose_offset_px
+        counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite
+    total = offsets[-1]
+    observation_row = observation_row[:total]
+    return ModelResiduals(
+        offsets,
+        observation_row,
+        observations.point_idx if total == capacity else observations.point_idx[observation_row],
+        residuals[:, :total],
+        jacobian[:, :, :total],
+        pose_offset,
+        *counts,
+    )

@@ -1,0 +1,74 @@
+"""Is the pose at the optimum of its own residuals? (method.md section 6)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray
+
+_SMALLEST_PIVOT = 1e-10  # of the Gram matrix of unit columns; below it the orthonormal basis is taken by SVD
+
+
+def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return (6, 2, n): d projection / d (rotation, translation), left perturbation in the camera frame.
+
+    Parameters
+    ----------
+    jacobian_cam : (2, 3, n) d projection / d point in the camera frame, px per model unit
+    xyz_cam : (3, n) points in the camera frame, model units
+
+    Notes
+    -----
+    A rotation by the small vector w (rad) about the camera centre moves a point by w x Xc, a translation t by t.
+    """
+    x, y, z = xyz_cam
+    jx, jy, jz = jacobian_cam.transpose(1, 0, 2)
+    out = np.empty((6, *jx.shape))
+    out[0] = jz * y - jy * z
+    out[1] = jx * z - jz * x
+    out[2] = jy * x - jx * y
+    out[3:] = jacobian_cam.transpose(1, 0, 2)
+    return out
+
+
+def pose_jacobian(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+    """Return (n, 2, 6): `pose_columns` with points first, of (n, 2, 3) and (n, 3)."""
+    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam.T).transpose(2, 1, 0)
+
+
+def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: FloatArray) -> float:
+    """Return |Q_pose^T y| / sqrt n: the RMS length, px, of what moving the pose alone would remove.
+
+    Parameters
+    ----------
+    residuals_px : (2, n) observed - projected        jacobian_cam, xyz_cam : as in `pose_columns`
+
+    Returns
+    -------
+    float
+        px; NaN without observations. A bundle-adjusted image has ~0, a pose changed afterwards 1..3.
+    """
+    n = residuals_px.shape[1]
+    if n == 0:
+        return math.nan
+    columns = pose_columns(jacobian_cam, xyz_cam).reshape(6, 2 * n)
+    gram = columns @ columns.T
+    if not np.isfinite(gram).all():  # at the poles of a panorama: such a point does not move the pose
+        columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
+        gram = columns @ columns.T
+    used = gram.diagonal() > 0
+    norms = np.sqrt(gram.diagonal()[used])
+    y = residuals_px.reshape(2 * n)
+    right = (columns @ y)[used] / norms
+    try:
+        factor = np.linalg.cholesky(gram[np.ix_(used, used)] / norms / norms[:, None])
+    except np.linalg.LinAlgError:
+        factor = np.zeros((1, 1))
+    if factor.diagonal().min() ** 2 > _SMALLEST_PIVOT:
+        projected = np.linalg.solve(factor, right)
+    else:
+        basis, singular, _ = np.linalg.svd(columns[used].T / norms, full_matrices=False)
+        projected = basis[:, singular > 1e-9 * singular[0]].T @ y
+    return float(np.sqrt(projected @ projected / n))

@@ -1,0 +1,324 @@
+"""Noise belongs to tracks: predict an observation from the rest of its track (method.md section 3b, (4) and (5)).
+
+Track variances are s0^2 nu0 / chi^2(nu0) over a model. Given the rest of its track, a whitened residual is then
+bivariate t; `student_to_normal` maps it to two standard normal numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from sfm_audit.audit.noise.fits import CONSISTENCY, CUTOFF
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+
+MIN_OBSERVATIONS = 20
+NU0_RANGE = (0.1, 1e4)
+_CHUNK = 1 << 15
+_MAX_ITERATIONS = 60
+_STEP = 1.0 / 32.0  # node distance of the quantile tables in w
+_TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
+_NUM_CELLS = round(_TABLE_END / _STEP)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPrior:
+    """How track variances scatter over a model: s0^2 nu0 / chi^2(nu0); NaN where it could not be fitted."""
+
+    nu0: float
+    s0_px: float
+
+
+def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: IntArray) -> TrackPrior:
+    """Fit (nu0, s0) by maximum likelihood over all verified observations of a model.
+
+    Parameters
+    ----------
+    sq_px2 : (m,) q = |e_k|^2          other_sq_px2 : (m,) c = nu_k a_k^2 of (3)          other_dof : (m,) nu_k
+
+    Returns
+    -------
+    TrackPrior
+        NaN with fewer than 20 observations or where all residuals are zero; 0.1 <= nu0 <= 1e4.
+
+    Notes
+    -----
+    With P = nu0 s0^2, B = P + c and nu = nu0 + nu_k the log likelihood of method.md (4) is
+    sum ln nu + nu / 2 ln B - (nu / 2 + 1) ln(B + q): two logarithms an observation, and a 2 x 2 Hessian in closed
+    form. Newton on (ln nu0, ln P) from a coarse grid on a systematic subsample; damped where it does not ascend.
+    """
+    if sq_px2.size < MIN_OBSERVATIONS or not sq_px2.any():
+        return TrackPrior(math.nan, math.nan)
+    dof = other_dof.astype(np.float64)
+    stride = max(1, sq_px2.size // 20_000)
+    sample = sq_px2[::stride], other_sq_px2[::stride], dof[::stride]
+    best = max(
+        (
+            np.array([nu, math.log(math.exp(nu) * s2)])
+            for s2 in _scale_grid(*sample)
+            for nu in np.log([0.3, 1.0, 3.0, 10.0, 100.0])
+        ),
+        key=lambda x: _log_likelihood(x, *sample)[0],
+    )
+    best = _maximise(best, *sample)
+    best = _maximise(best, sq_px2, other_sq_px2, dof)
+    nu0 = math.exp(best[0])
+    return TrackPrior(nu0, math.sqrt(math.exp(best[1]) / nu0))
+
+
+def _scale_grid(sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> list[float]:
+    """Plausible s0^2: around the pooled variance per degree of freedom and the median of |e|^2 / 2."""
+    centre = max(float(np.median(sq)) / (2.0 * math.log(2.0)), np.finfo(np.float64).tiny)
+    pooled = max(float((sq + other_sq).sum() / (dof + 2.0).sum()), centre)
+    return [centre * 0.3, centre, pooled]
+
+
+def _maximise(start: FloatArray, sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> FloatArray:
+    """Newton ascent in x = (ln nu0, ln P), nu0 kept inside its range by holding it at the bound."""
+    low, high = math.log(NU0_RANGE[0]), math.log(NU0_RANGE[1])
+    x = start
+    value, gradient, hessian = _log_likelihood(x, sq, other_sq, dof)
+    for _ in range(_MAX_ITERATIONS):
+        at_bound = (x[0] <= low and gradient[0] < 0) or (x[0] >= high and gradient[0] > 0)
+        step = _ascent_step(gradient, hessian, hold_first=at_bound)
+        step *= min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-300))
+        while True:
+            trial = x + step
+            if trial[0] < low or trial[0] > high:  # stay on the ray that keeps s0, land on the bound
+                bounded = min(max(float(trial[0]), low), high)
+                trial = np.array([bounded, trial[1] + bounded - trial[0]])
+            moved = float(np.abs(trial - x).max())
+            trial_value, trial_gradient, trial_hessian = _log_likelihood(trial, sq, other_sq, dof)
+            if trial_value >= value or moved <= 1e-10:
+                break
+            step = 0.5 * step
+        x, value, gradient, hessian = trial, trial_value, trial_gradient, trial_hessian
+        if moved <= 1e-8:
+            break
+    return x
+
+
+def _ascent_step(gradient: FloatArray, hessian: FloatArray, *, hold_first: bool) -> FloatArray:
+    """Newton step where the Hessian is negative definite, otherwise a step along the scaled gradient."""
+    if hold_first:
+        curvature = -hessian[1, 1] if hessian[1, 1] < 0 else max(abs(float(gradient[1])), 1e-300)
+        return np.array([0.0, gradient[1] / curvature])
+    determinant = hessian[0, 0] * hessian[1, 1] - hessian[0, 1] ** 2
+    if hessian[0, 0] < 0 and determinant > 0:
+        return np.asarray(-np.linalg.solve(hessian, gradient))
+    return gradient / max(float(np.abs(gradient).max()), 1e-300)
+
+
+def _log_likelihood(
+    x: FloatArray, sq: FloatArray, other_sq: FloatArray, dof: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Log likelihood, gradient (2,) and Hessian (2, 2) in (ln nu0, ln P)."""
+    nu0, prior_sq = math.exp(x[0]), math.exp(x[1])
+    total = np.zeros(6)
+    for start in range(0, sq.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        nu = dof[part] + nu0
+        b = other_sq[part] + prior_sq
+        bq = b + sq[part]
+        inv_b, inv_bq, inv_nu = 1.0 / b, 1.0 / bq, 1.0 / nu
+        log_b, log_bq = np.log(b), np.log(bq)
+        difference = log_b - log_bq
+        half = 0.5 * nu
+        total += (
+            np.log(nu).sum() + half @ difference - log_bq.sum(),
+            inv_nu.sum() + 0.5 * difference.sum(),  # d / d nu0
+            half @ inv_b - (half + 1.0) @ inv_bq,  # d / d P
+            -(inv_nu @ inv_nu),  # d2 / d nu0^2
+            0.5 * (inv_b.sum() - inv_bq.sum()),  # d2 / d nu0 d P
+            (half + 1.0) @ (inv_bq * inv_bq) - half @ (inv_b * inv_b),  # d2 / d P^2
+        )
+    value, d_nu, d_p, d_nu_nu, d_nu_p, d_p_p = total
+    gradient = np.array([d_nu * nu0, d_p * prior_sq])
+    hessian = np.array(
+        [
+            [d_nu_nu * nu0**2 + gradient[0], d_nu_p * nu0 * prior_sq],
+            [d_nu_p * nu0 * prior_sq, d_p_p * prior_sq**2 + gradient[1]],
+        ]
+    )
+    return float(value), gradient, hessian
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What the tracks predict for n observations: scale (n,) px of (4), degrees of freedom by table row.
+
+    nu_values: (v,) the distinct nu = nu0 + nu_k.        nu_row: (n,) row of nu_values for each observation.
+    """
+
+    scale_px: FloatArray
+    nu_values: FloatArray
+    nu_row: IntArray
+
+
+def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: IntArray) -> Prediction:
+    """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4)."""
+    distinct = np.flatnonzero(np.bincount(other_dof))  # small positive integers: no need to sort two million of them
+    row_of = np.zeros(int(distinct[-1]) + 1 if distinct.size else 1, dtype=np.int64)
+    row_of[distinct] = np.arange(distinct.size)
+    row = row_of[other_dof]
+    nu = prior.nu0 + distinct.astype(np.float64)
+    scale_sq = (prior.nu0 * prior.s0_px**2 + other_sq_px2) / nu[row]
+    return Prediction(np.sqrt(scale_sq), nu, row)
+
+
+class StudentToNormal:
+    """Map t to z = Phi^-1(T_nu(t)) for a fixed list of nu, by cubic interpolation of z / w.
+
+    w = sign(t) sqrt(nu ln(1 + t^2 / nu)) is Wallace's (1959) variable: z / w is smooth, even and close to 1, so nodes
+    1/32 apart reproduce z to 1e-9; checked against SciPy in the tests. |w| > 6 is computed one by one, in logarithms
+    where T underflows.
+    """
+
+    def __init__(self, nu_values: FloatArray) -> None:
+        self.nu_values = nu_values
+        nodes: FloatArray = np.arange(_NUM_CELLS + 2, dtype=np.float64) * _STEP
+        ratio = np.empty((len(nu_values), nodes.size))
+        slope = np.empty_like(ratio)
+        for row, nu in enumerate(nu_values):
+            ratio[row], slope[row] = _ratio_and_slope(float(nu), nodes)
+        left, right = ratio[:, :-1], ratio[:, 1:]
+        left_slope, right_slope = slope[:, :-1] * _STEP, slope[:, 1:] * _STEP
+        rise = right - left
+        cubic = [left, left_slope, 3.0 * rise - 2.0 * left_slope - right_slope, left_slope + right_slope - 2.0 * rise]
+        self._coefficients = np.stack(cubic, axis=-1).reshape(-1, 4)
+
+    def __call__(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+        """Transform t (m,) with degrees of freedom nu (m,) = nu_values[nu_row]."""
+        w = np.sqrt(nu * np.log1p(t * t / nu))
+        cell_position = w * (1.0 / _STEP)
+        outside = np.flatnonzero(cell_position >= _NUM_CELLS)
+        np.minimum(cell_position, _NUM_CELLS, out=cell_position)
+        cell = cell_position.astype(np.int64)
+        c = self._coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0)
+        fraction = cell_position - cell
+        ratio = ((c[:, 3] * fraction + c[:, 2]) * fraction + c[:, 1]) * fraction + c[:, 0]
+        z = np.copysign(w * ratio, t)
+        if outside.size:
+            z[outside] = student_to_normal(t[outside], nu[outside])
+        return z
+
+
+def _ratio_and_slope(nu: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ratio z / w and its derivative at nodes w >= 0, w[0] = 0."""
+    inner = w[1:]
+    t = np.sqrt(nu * np.expm1(inner**2 / nu))
+    z = student_to_normal(t, np.full_like(t, nu))
+    log_density_t = special.gammaln(0.5 * (nu + 1)) - special.gammaln(0.5 * nu) - 0.5 * math.log(nu * math.pi)
+    log_ratio_at_zero = log_density_t + 0.5 * math.log(2 * math.pi)
+    # dz / dw = f_T(t) dt/dw / phi(z), with dt/dw = w (1 + t^2 / nu) / t and f_T ~ exp(-(nu + 1) w^2 / (2 nu))
+    log_pdf = log_ratio_at_zero - 0.5 * (nu + 1) / nu * inner**2 + 0.5 * z * z
+    dz_dw = np.exp(log_pdf + inner**2 / nu) * inner / t
+    ratio = np.concatenate([[math.exp(log_ratio_at_zero)], z / inner])
+    slope = np.concatenate([[0.0], (dz_dw - z / inner) / inner])
+    return ratio, slope
+
+
+def student_to_normal(t: FloatArray, nu: FloatArray) -> FloatArray:
+    """Return z = Phi^-1(T_nu(t)) exactly, also where T_nu(t) underflows (then through the logarithm of the tail)."""
+    tail = special.stdtr(nu, -np.abs(t))
+    with np.errstate(divide="ignore"):
+        z = -special.ndtri(tail)
+    for i in np.flatnonzero(tail < 1e-290):
+        z[i] = -special.ndtri_exp(_log_student_tail(float(abs(t[i])), float(nu[i])))
+    return np.copysign(z, t)
+
+
+def _log_student_tail(t: float, nu: float) -> float:
+    """Return ln P(T_nu > t) for large t > 0: half an incomplete beta function by its hypergeometric series."""
+    a, log_u = 0.5 * nu, math.log1p(t * t / nu)  # x = nu / (nu + t^2) = exp(-log_u)
+    x = math.exp(-log_u)
+    log_front = -a * log_u + 0.5 * math.log1p(-x) - math.log(2.0 * a) - float(special.betaln(a, 0.5))
+    term, total, k = 1.0, 1.0, 0
+    while term > 1e-16 * total:
+        term *= (a + 0.5 + k) / (a + 1.0 + k) * x
+        total += term
+        k += 1
+    return log_front + math.log(total)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandardisedImage:
+    """One image's standard normal numbers z (m, 2) of (5) and its factor f; NaN f where it could not be solved."""
+
+    z: FloatArray
+    factor: float
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackStandardiser:
+    """(5) for the images of one model: tables for x (nu) and for y given x (nu + 1)."""
+
+    prediction: Prediction
+    first: StudentToNormal
+    second: StudentToNormal
+
+    @classmethod
+    def build(cls, prediction: Prediction) -> TrackStandardiser:
+        """Tabulate the transformations that the model's degrees of freedom need."""
+        return cls(prediction, StudentToNormal(prediction.nu_values), StudentToNormal(prediction.nu_values + 1.0))
+
+    def standardise(self, whitened_px: FloatArray, rows: IntArray | slice) -> StandardisedImage:
+        """Solve the image's factor f and return z at it.
+
+        Parameters
+        ----------
+        whitened_px : (2, m) e of the image's verified observations        rows : their rows in the prediction
+
+        Notes
+        -----
+        f makes the robust variance of the pooled z equal to 1: mean(min(z^2, c^2)) = kappa, to 1e-10. The left side
+        decreases in f; the root is bracketed and refined by the secant rule.
+        """
+        prediction = self.prediction
+        nu_row = prediction.nu_row[rows]
+        nu = prediction.nu_values[nu_row]
+        t = whitened_px / prediction.scale_px[rows]
+        if t.size == 0 or not np.isfinite(t).all() or np.count_nonzero(t) * CUTOFF**2 <= t.size * CONSISTENCY:
+            return StandardisedImage(np.full(t.T.shape, np.nan), math.nan, converged=False)
+        log_f, low, high = 0.0, -math.inf, math.inf
+        previous: tuple[float, float] | None = None
+        for _ in range(_MAX_ITERATIONS):
+            z = self._transform(t * math.exp(-log_f), nu_row, nu)
+            excess, slope = _robust_excess(z)
+            if abs(excess) <= 1e-10:
+                return StandardisedImage(z, math.exp(log_f), converged=True)
+            low, high = (log_f, high) if excess > 0 else (low, log_f)
+            if previous is not None and previous[1] != excess:
+                step = -excess * (log_f - previous[0]) / (excess - previous[1])
+            else:
+                step = excess / slope
+            previous = log_f, excess
+            log_f = _inside(log_f, step, low, high)
+        return StandardisedImage(z, math.exp(log_f), converged=False)
+
+    def _transform(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+        z = np.empty((t.shape[1], 2))
+        z[:, 0] = self.first(t[0], nu_row, nu)
+        z[:, 1] = self.second(t[1] * np.sqrt((nu + 1.0) / (nu + t[0] * t[0])), nu_row, nu + 1.0)
+        return z
+
+
+def _robust_excess(z: FloatArray) -> tuple[float, float]:
+    """mean(min(z^2, c^2)) - kappa, and a guess of minus its derivative in ln f."""
+    sq = z.ravel() ** 2
+    inside: BoolArray = sq < CUTOFF**2
+    unclipped = float(np.dot(sq, inside)) / sq.size
+    clipped = CUTOFF**2 * (1.0 - np.count_nonzero(inside) / sq.size)
+    return unclipped + clipped - CONSISTENCY, 2.0 * unclipped
+
+
+def _inside(x: float, step: float, low: float, high: float) -> float:
+    """The next x, kept inside the bracket (bisected where the step leaves it) and within e^3 of the last."""
+    trial = x + max(-3.0, min(3.0, step))
+    if low < trial < high:
+        return trial
+    return 0.5 * (low + high) if math.isfinite(low) and math.isfinite(high) else x + math.copysign(1.0, step)

@@ -1,0 +1,166 @@
+"""From residuals to standard normal numbers under a noise model, by name (method.md sections 2 and 3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
+from sfm_audit.audit.noise.predictive import TrackPrior, TrackStandardiser, fit_track_prior, predict
+from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+
+_A_SQ_QUANTILE = 0.99  # predictors above it count as if they were there, in the paper's form (1) only
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageNoise:
+    """The noise of one image under one model; NaN where the model does not have the number.
+
+    z: (m, 2) standardised residuals, x and y.          sigma_constant_px: robust sd per axis of the raw residuals.
+    sigma_d_px, sigma_l: (1).   sigma_predicted_px: median f scale of (4).   scale_ratio: f^2 of (5).
+    """
+
+    z: FloatArray
+    sigma_constant_px: float
+    sigma_d_px: float
+    sigma_l: float
+    sigma_predicted_px: float
+    scale_ratio: float
+    converged: bool
+
+
+def constant_noise(residuals_px: FloatArray) -> ImageNoise:
+    """Noise model ``constant``: one robust scale for the raw residuals (2, n) of all inliers."""
+    fit = fit_constant_variance(residuals_px**2)
+    sigma = math.sqrt(fit.detector_px2)
+    return ImageNoise(residuals_px.T / sigma, sigma, sigma, math.nan, sigma, math.nan, fit.converged)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelTracks:
+    """Track statistics of all inliers of a model, from stationary images only, and the prior fitted to them.
+
+    nonstationary: (I,) pose_offset_px above the threshold: left out of the tracks of all others, unless they are more
+    than half of the images with inliers (too_many_nonstationary).
+    offsets: (I + 1,) inliers by image.            verified_offsets: (I + 1,) verified inliers by image.
+    standardiser: None where the prior is undetermined.
+    """
+
+    statistics: TrackStatistics
+    nonstationary: BoolArray
+    too_many_nonstationary: bool
+    offsets: IntArray
+    verified_offsets: IntArray
+    prior: TrackPrior
+    standardiser: TrackStandardiser | None
+
+
+def model_tracks(
+    residuals: ModelResiduals,
+    num_points: int,
+    *,
+    pose_offset_threshold_px: float,
+    min_track_length: int,
+    min_eigenvalue: float,
+) -> ModelTracks:
+    """Whiten a model's residuals and fit its track prior.
+
+    Notes
+    -----
+    method.md section 3b: wrong poses inflate everybody's a^2. An image with pose_offset_px above the threshold is left
+    out of the tracks of all others and of the prior; its own observations keep the values of the full tracks. If more
+    than half of the images (with inliers) exceed it, none is left out.
+    """
+
+    def statistics_of(rows: BoolArray | slice) -> TrackStatistics:
+        return track_statistics(
+            residuals.residuals_px[:, rows],
+            residuals.point_jacobian[:, :, rows],
+            residuals.point_idx[rows],
+            num_points,
+            min_track_length=min_track_length,
+            min_eigenvalue=min_eigenvalue,
+        )
+
+    moved = residuals.pose_offset_px > pose_offset_threshold_px
+    num_audited = int(np.count_nonzero(np.diff(residuals.offsets)))
+    too_many = bool(2 * np.count_nonzero(moved) > num_audited)
+    left_out = np.zeros_like(moved) if too_many else moved
+    statistics = statistics_of(slice(None))
+    kept = np.repeat(~left_out, np.diff(residuals.offsets))
+    if left_out.any():
+        statistics = _replace_rows(statistics, kept, statistics_of(kept))
+    used = statistics.verified & kept
+    sq = (statistics.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
+    prior = fit_track_prior(sq, statistics.other_sq_px2[used], statistics.other_dof[used])
+    standardiser = None
+    if math.isfinite(prior.nu0):
+        verified = statistics.verified
+        standardiser = TrackStandardiser.build(
+            predict(prior, statistics.other_sq_px2[verified], statistics.other_dof[verified])
+        )
+    verified_before = np.concatenate([[0], np.cumsum(statistics.verified)])
+    return ModelTracks(
+        statistics, moved, too_many, residuals.offsets, verified_before[residuals.offsets], prior, standardiser
+    )
+
+
+def _replace_rows(full: TrackStatistics, rows: BoolArray, part: TrackStatistics) -> TrackStatistics:
+    """Return the statistics of ``part`` in ``rows``, of ``full`` elsewhere; the model's sums of squares of ``part``."""
+    whitened, verified, length, other_sq, other_dof = (
+        full.whitened_px.copy(),
+        full.verified.copy(),
+        full.track_length.copy(),
+        full.other_sq_px2.copy(),
+        full.other_dof.copy(),
+    )
+    whitened[:, rows] = part.whitened_px
+    verified[rows], length[rows] = part.verified, part.track_length
+    other_sq[rows], other_dof[rows] = part.other_sq_px2, part.other_dof
+    return replace(
+        part,
+        whitened_px=whitened,
+        verified=verified,
+        track_length=length,
+        other_sq_px2=other_sq,
+        other_dof=other_dof,
+    )
+
+
+def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -> ImageNoise:
+    """Noise model ``track`` for the image in row ``image_idx`` of the model."""
+    statistics = tracks.statistics
+    rows = slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
+    own = slice(int(tracks.verified_offsets[image_idx]), int(tracks.verified_offsets[image_idx + 1]))
+    verified = statistics.verified[rows]
+    whitened = statistics.whitened_px[:, rows].compress(verified, axis=1)  # rows of memory; [:, verified] has columns
+    if tracks.standardiser is None or whitened.size == 0:
+        empty = np.full(whitened.T.shape, math.nan)
+        return ImageNoise(empty, sigma_constant_px, math.nan, math.nan, math.nan, math.nan, converged=False)
+    standardised = tracks.standardiser.standardise(whitened, own)
+    predictor = statistics.other_sq_px2[rows][verified] / statistics.other_dof[rows][verified]  # a_k^2 of (3)
+    predictor = np.minimum(predictor, _quantile(predictor, _A_SQ_QUANTILE))
+    paper = fit_variance(whitened**2, predictor)
+    factor = standardised.factor
+    return ImageNoise(
+        standardised.z,
+        sigma_constant_px,
+        math.sqrt(paper.detector_px2),
+        math.sqrt(paper.structure),
+        _quantile(tracks.standardiser.prediction.scale_px[own], 0.5) * factor,
+        factor**2,
+        paper.converged and standardised.converged,
+    )
+
+
+def _quantile(values: FloatArray, q: float) -> float:
+    """Linear interpolation between order statistics, as numpy.quantile, at a tenth of its cost for short arrays."""
+    position = q * (values.size - 1)
+    low = int(position)
+    kth = [low, min(low + 1, values.size - 1)]
+    below, above = np.partition(values, kth)[kth]
+    return float(below + (position - low) * (above - below))

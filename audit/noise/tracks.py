@@ -1,0 +1,229 @@
+"""Residuals of a reconstruction are shrunk by their own points: undo it (method.md sections 3a and 3b, (2) and (3)).
+
+Everything works on all observations of a model at once; ``point_idx`` ties an observation to its track.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+
+_SUFFICIENT_DETERMINANT = 1e-6  # of the information matrix with unit diagonal: closed-form inverse, else eigenvectors
+_RANK_THRESHOLD = 1e-10  # eigenvalues of that matrix, relative to the largest: singular values of J below 1e-5
+_CHUNK = 1 << 14  # observations per pass: the temporaries stay in the processor's cache
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackStatistics:
+    """What the tracks say about each of n observations.
+
+    whitened_px: (2, n) e of (2), covariance sigma^2 I under a correct model; NaN where not verified.
+    verified: (n,) L >= min_track_length, the smaller eigenvalue of I - H >= min_eigenvalue, J finite (it is not at the
+    poles of a panorama and on the rim of a division model; such an observation does not move its point either).
+    track_length: (n,) L, audited observations of the track.
+    other_sq_px2: (n,) nu_k a_k^2 of (3): the track's sum of squares without observation k, floored at 0, px^2.
+    other_dof: (n,) nu_k = 2 L - 2 - rank.
+    removable_sq_px2, total_sq_px2: what moving the points alone would remove of the sum of squared residuals.
+    """
+
+    whitened_px: FloatArray
+    verified: BoolArray
+    track_length: IntArray
+    other_sq_px2: FloatArray
+    other_dof: IntArray
+    removable_sq_px2: float
+    total_sq_px2: float
+
+
+def track_statistics(
+    residuals_px: FloatArray,
+    point_jacobian: FloatArray,
+    point_idx: IntArray,
+    num_points: int,
+    *,
+    min_track_length: int = 3,
+    min_eigenvalue: float = 0.05,
+) -> TrackStatistics:
+    r"""Whiten residuals whose 3D points were triangulated from them, and take each track's sum of squares without it.
+
+    Parameters
+    ----------
+    residuals_px : (2, n)         observed minus projected, px
+    point_jacobian : (2, 3, n)    d projection / d point, px per model unit
+    point_idx : (n,)              row of the 3D point of each observation
+
+    Notes
+    -----
+    With A = sum J^T J over a track: cov(eps_k) = sigma^2 (I - H_k), H_k = J_k A^-1 J_k^T,
+    e_k = (I - H_k)^(-1/2) eps_k (2). Columns of J are scaled per track; a singular A is replaced by its
+    pseudo-inverse and the rank lowers the degrees of freedom. Residuals are first projected off the column space of
+    their track: points are not always at their optimum. |e_k|^2 is exactly what k adds to the track's sum of squares,
+    so the sum without k is SS - |e_k|^2 (3).
+
+    Cameras are treated as exact: their share of the leverage is 8 / 2n of an image, and is left in.
+    """
+    n = residuals_px.shape[1]
+    differentiable = _finite_columns(point_jacobian)
+    if not differentiable.all():
+        point_jacobian = np.where(differentiable, point_jacobian, 0.0)
+    length = np.bincount(point_idx, minlength=num_points)
+    inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
+    projected, complement, removable = _project_off_points(residuals_px, point_jacobian, point_idx, inverse)
+    square = np.empty(n)
+    for part in _chunks(n):
+        np.multiply(projected[0, part], projected[0, part], out=square[part])
+        square[part] += projected[1, part] * projected[1, part]
+    track_sq = sum_by_point(square, point_idx, num_points)
+
+    whitened, verified, other_sq = projected, np.empty(n, dtype=bool), square  # what is read is not needed again
+    track_length = length.take(point_idx)
+    for part in _chunks(n):
+        smallest, x, y = _inverse_root_times(complement[:, part], projected[:, part])
+        good = (track_length[part] >= min_track_length) & (smallest >= min_eigenvalue) & differentiable[part]
+        verified[part] = good
+        other = np.maximum(track_sq.take(point_idx[part]) - (x * x + y * y), 0.0)  # (3)
+        whitened[0, part] = np.where(good, x, np.nan)
+        whitened[1, part] = np.where(good, y, np.nan)
+        other_sq[part] = np.where(good, other, np.nan)
+    return TrackStatistics(
+        whitened,
+        verified,
+        track_length,
+        other_sq,
+        (2 * length - 2 - rank).take(point_idx),
+        removable,
+        sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(n)),
+    )
+
+
+def _finite_columns(point_jacobian: FloatArray) -> BoolArray:
+    finite = np.empty(point_jacobian.shape[2], dtype=bool)
+    for part in _chunks(finite.size):
+        np.isfinite(point_jacobian[:, :, part]).all(axis=(0, 1), out=finite[part])
+    return finite
+
+
+def _project_off_points(
+    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IntArray, inverse: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Residuals (2, n) off their tracks' column spaces, I - H as (3, n) xx, xy, yy, and the sum of squares removed."""
+    n = point_idx.size
+    gradient = np.empty_like(inverse[:3])
+    product = np.empty(n)
+    for axis in range(3):
+        _sum_of_two_products(point_jacobian[:, axis], residuals_px, product)
+        gradient[axis] = sum_by_point(product, point_idx, inverse.shape[1])
+    step = symmetric_times(inverse, gradient)  # A^+ J^T eps: where the points would move
+    projected = np.empty_like(residuals_px)
+    complement = np.empty((3, n))
+    removable = 0.0
+    for part in _chunks(n):
+        idx = point_idx[part]
+        jacobian = point_jacobian[:, :, part]
+        move = step.take(idx, axis=1)
+        for row in range(2):
+            removed = _dot(jacobian[row], move)
+            removable += float(removed @ removed)
+            np.subtract(residuals_px[row, part], removed, out=projected[row, part])
+        local = inverse.take(idx, axis=1)
+        by_x, by_y = symmetric_times(local, jacobian[0]), symmetric_times(local, jacobian[1])
+        np.subtract(1.0, _dot(jacobian[0], by_x), out=complement[0, part])
+        np.negative(_dot(jacobian[1], by_x), out=complement[1, part])
+        np.subtract(1.0, _dot(jacobian[1], by_y), out=complement[2, part])
+    return projected, complement, removable
+
+
+def _sum_of_two_products(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Write a[0] b[0] + a[1] b[1] of (2, n) arrays into out (n,), a piece at a time."""
+    for part in _chunks(out.size):
+        np.multiply(a[0, part], b[0, part], out=out[part])
+        out[part] += a[1, part] * b[1, part]
+
+
+def _chunks(n: int) -> list[slice]:
+    return [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
+
+
+def sum_by_point(values: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
+    """Sum values (n,) of observations by their track: (P,)."""
+    return np.bincount(point_idx, weights=values, minlength=num_points).astype(np.float64, copy=False)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products of columns: (3, n), (3, n) -> (n,)."""
+    out = a[0] * b[0]
+    out += a[1] * b[1]
+    out += a[2] * b[2]
+    return np.asarray(out, dtype=np.float64)
+
+
+def symmetric_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Multiply symmetric 3x3 matrices (6, n) in the order of _SYMMETRIC times vectors (3, n)."""
+    xx, xy, xz, yy, yz, zz = matrix
+    x, y, z = vector
+    out = np.empty((3, vector.shape[1]))
+    out[0] = xx * x + xy * y + xz * z
+    out[1] = xy * x + yy * y + yz * z
+    out[2] = xz * x + yz * y + zz * z
+    return out
+
+
+def inverse_information(
+    point_jacobian: FloatArray, point_idx: IntArray, num_points: int
+) -> tuple[FloatArray, IntArray]:
+    """Return the (pseudo-)inverse (6, P) of each track's information A = sum J^T J, and its rank (P,)."""
+    information = np.empty((6, num_points))
+    product = np.empty(point_idx.size)
+    for row, (i, j) in enumerate(_SYMMETRIC):
+        _sum_of_two_products(point_jacobian[:, i], point_jacobian[:, j], product)
+        information[row] = sum_by_point(product, point_idx, num_points)
+    scale = np.sqrt(information[[0, 3, 5]])
+    scale[scale == 0] = 1.0
+    xx, xy, xz, yy, yz, zz = (information[row] / (scale[i] * scale[j]) for row, (i, j) in enumerate(_SYMMETRIC))
+    cofactor = np.stack(
+        [
+            yy * zz - yz * yz,
+            xz * yz - xy * zz,
+            xy * yz - xz * yy,
+            xx * zz - xz * xz,
+            xy * xz - xx * yz,
+            xx * yy - xy * xy,
+        ]
+    )
+    determinant = xx * cofactor[0] + xy * cofactor[1] + xz * cofactor[2]
+    regular = determinant > _SUFFICIENT_DETERMINANT
+    inverse = cofactor / np.where(regular, determinant, 1.0)
+    rank = np.full(num_points, 3, dtype=np.int64)
+    singular = np.flatnonzero(~regular)
+    if singular.size:
+        full = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[:, :, singular].transpose(2, 0, 1)
+        values, vectors = np.linalg.eigh(full)
+        kept = values > _RANK_THRESHOLD * values[:, -1:]
+        rank[singular] = kept.sum(axis=1)
+        weights = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+        pseudo = np.einsum("pij,pj,pkj->ikp", vectors, weights, vectors)
+        inverse[:, singular] = np.stack([pseudo[i, j] for i, j in _SYMMETRIC])
+    for row, (i, j) in enumerate(_SYMMETRIC):
+        inverse[row] /= scale[i] * scale[j]
+    return inverse, rank
+
+
+def _inverse_root_times(matrix: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Smaller eigenvalue of symmetric 2x2 matrices (3, n), and their inverse symmetric root times vectors (2, n).
+
+    The root of M is (M + sqrt(det) I) / sqrt(trace + 2 sqrt(det)); where M is not positive definite the result is
+    meaningless and the eigenvalue says so.
+    """
+    xx, xy, yy = matrix
+    half_trace = 0.5 * (xx + yy)
+    smallest = half_trace - np.hypot(0.5 * (xx - yy), xy)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root_det = np.sqrt(xx * yy - xy * xy)
+        factor = 1.0 / (root_det * np.sqrt(2.0 * (half_trace + root_det)))  # 1 / (sqrt(det) sqrt(trace + 2 sqrt(det)))
+        x = factor * ((yy + root_det) * vector[0] - xy * vector[1])
+        y = factor * ((xx + root_det) * vector[1] - xy * vector[0])
+    return smallest, x, y

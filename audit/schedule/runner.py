@@ -1,0 +1,141 @@
+"""How are many models audited? Each by itself, wherever that happens, and its tables into a sink as it is finished.
+
+The content of a run does not depend on the order in which models finish: each model is audited by itself, from its
+own files and the config.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from typing import Protocol
+
+import pyarrow as pa
+from threadpoolctl import threadpool_limits
+
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.schedule.processes import in_processes, planned
+from sfm_audit.audit.schedule.task import (
+    Audited,
+    AuditFunction,
+    Failure,
+    Outcome,
+    Task,
+    Unchanged,
+    audit_one,
+    too_large,
+)
+from sfm_audit.loaders import LoadError, ModelRef
+from sfm_audit.loaders.datasets.input_state import InputState, input_stamp
+
+__all__ = ["AuditFunction", "Audited", "Failure", "Outcome", "Sink", "Task", "Unchanged", "audit_many", "audit_one"]
+
+
+class Sink(Protocol):
+    """Where the tables of finished models go (reports.store.RunStore)."""
+
+    def finished(self, ref: ModelRef) -> InputState | None:
+        """Return the input a model was finished with under this config, or None."""
+
+    def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
+        """Take the tables of one model, in place of what was there."""
+
+    def drop(self, key: str) -> None:
+        """Forget a model."""
+
+
+def audit_many(
+    refs: Sequence[ModelRef],
+    config: AuditConfig,
+    *,
+    jobs: int,
+    sink: Sink,
+    on_done: Callable[[ModelRef], None] = lambda _: None,
+    on_skip: Callable[[ModelRef], None] | None = None,
+    audit: AuditFunction = audit_one,
+    observations: bool = False,
+    dask: str | None = None,
+    max_model_bytes: int | None = None,
+) -> list[Failure]:
+    """Audit models and hand their tables to a sink.
+
+    Parameters
+    ----------
+    refs : the models, no key twice
+    config : the same for all
+    jobs : number of processes; 1 audits in this one
+    sink : models that it has finished from the same input are not audited again
+    on_done : called once per model, in the order in which they finish
+    on_skip : called in place of ``on_done``, before any model is audited, for models that need no audit
+    audit : what to do with one model; must be importable by name unless it runs in this process
+    observations : whether to make the tables of observations too, one row per inlier
+    dask : address of a Dask scheduler whose workers audit, or "local": ``jobs`` Dask workers on this machine
+    max_model_bytes : a larger model is not loaded but becomes a Failure
+
+    Returns
+    -------
+    list of Failure
+        Models that could not be read, or whose process died twice, in the order of ``refs``. Their earlier tables are
+        removed from the sink.
+
+    Raises
+    ------
+    ClusterError
+        The Dask cluster cannot be used, or was lost.
+    """
+    failures: dict[str, Failure] = {}
+    tasks = []
+    for ref in refs:
+        known = sink.finished(ref)
+        if known is not None and _is_untouched(ref, known):
+            (on_skip or on_done)(ref)
+        else:
+            if max_model_bytes is not None and ref.num_bytes > max_model_bytes:
+                failures[ref.key] = too_large(ref, max_model_bytes)
+                sink.drop(ref.key)
+                on_done(ref)
+                continue
+            tasks.append(Task(ref, config, known.digest if known else None, observations))
+    with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
+        for task, outcome in outcomes:
+            if isinstance(outcome, Failure):
+                failures[task.ref.key] = outcome
+                sink.drop(task.ref.key)
+            elif isinstance(outcome, Audited):
+                sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
+            on_done(task.ref)
+    return [failures[ref.key] for ref in refs if ref.key in failures]
+
+
+def _outcomes(
+    tasks: Sequence[Task], jobs: int, audit: AuditFunction, dask: str | None
+) -> Generator[tuple[Task, Outcome]]:
+    """Audit in this process, in processes or on a cluster; elsewhere the largest models go first."""
+    if not tasks:
+        return
+    if dask is None and jobs <= 1:
+        yield from _in_this_process(tasks, audit)
+        return
+    plan = planned(tasks, jobs)
+    if dask is not None:
+        from sfm_audit.audit.schedule.cluster import in_cluster  # noqa: PLC0415 - imports Dask, which only this needs
+
+        yield from in_cluster([replace(task, num_processes=1) for task in plan], dask, jobs, audit)
+    elif len(plan) == 1 and plan[0].num_processes == 1:
+        yield from _in_this_process(plan, audit)
+    else:
+        yield from in_processes(plan, jobs, audit)
+
+
+def _is_untouched(ref: ModelRef, known: InputState) -> bool:
+    try:
+        return (ref.stamp or input_stamp(ref.location)) == known.stamp
+    except LoadError:
+        return False  # the audit itself will say what is wrong
+
+
+def _in_this_process(tasks: Sequence[Task], audit: AuditFunction) -> Generator[tuple[Task, Outcome]]:
+    with threadpool_limits(limits=1):
+        for task in tasks:
+            yield task, audit(task)

@@ -1,0 +1,185 @@
+"""What the files of a COLMAP model say, before anything is put together: the same tables for binary and text.
+
+Images and cameras are sorted by id; 3D points and tracks stay in the order of the file (``order`` sorts them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.errors import MalformedFileError, Position
+from sfm_audit.loaders.model import CameraTable, Finding
+from sfm_audit.loaders.paths.locations import InputPath
+
+UNLINKED: Final = np.uint64(2**64 - 1)
+FileFormat = Literal["binary", "text"]
+Sensor = tuple[int, int]
+CAMERA_SENSOR: Final = 0
+IDENTITY_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+Pose = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImages:
+    """The images file, sorted by image_id; of its POINTS2D only the linked ones.
+
+    poses: (I, 7) quaternion w x y z and translation, cam_from_world, as stored.
+    offsets: (I + 1,), image i owns rows offsets[i]:offsets[i + 1] of the last three.
+    point3d_id: (M,), never `UNLINKED`.
+    """
+
+    image_id: UInt32Array
+    name: tuple[str, ...]
+    camera_id: UInt32Array
+    poses: FloatArray
+    num_points2d: IntArray
+    offsets: IntArray
+    point2d_idx: IntArray
+    xy_px: FloatArray
+    point3d_id: UInt64Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawPoints:
+    """The points3D file in its own order; ``order`` (P,) sorts its points by id.
+
+    track_lengths: (P,). track_image_id, track_point2d_idx: (T,), the tracks one after the other.
+    """
+
+    point3d_id: UInt64Array
+    xyz_world: FloatArray
+    stored_error_px: FloatArray
+    order: IntArray
+    track_lengths: IntArray
+    track_image_id: UInt32Array
+    track_point2d_idx: UInt32Array
+
+
+@dataclass(frozen=True, slots=True)
+class RawRig:
+    """One rig: sensor_from_rig of every sensor, None where the file has no pose; identity for the reference sensor."""
+
+    rig_id: int
+    sensor_from_rig: dict[Sensor, Pose | None]
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """One frame: where its rig was, and the images it consists of."""
+
+    frame_id: int
+    rig_id: int
+    rig_from_world: Pose
+    image_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawModel:
+    """All files of one model. rigs and frames: None where the file does not exist."""
+
+    cameras: CameraTable
+    images: RawImages
+    points: RawPoints
+    rigs: tuple[RawRig, ...] | None
+    frames: tuple[RawFrame, ...] | None
+    findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawCamera:
+    """One camera as stored."""
+
+    camera_id: int
+    model_id: int
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImage:
+    """One image as stored, with the linked ones of its POINTS2D."""
+
+    image_id: int
+    pose: Pose
+    camera_id: int
+    name: str
+    num_points2d: int
+    point2d_idx: IntArray
+    xy_px: FloatArray
+    point3d_id: UInt64Array
+
+
+def camera_table(cameras: Sequence[RawCamera]) -> CameraTable:
+    """Return the cameras as columns, sorted by id."""
+    rows = sorted(cameras, key=lambda camera: camera.camera_id)
+    return CameraTable(
+        camera_id=np.array([row.camera_id for row in rows], dtype=np.uint32),
+        model_id=np.array([row.model_id for row in rows], dtype=np.int64),
+        width=np.array([row.width for row in rows], dtype=np.int64),
+        height=np.array([row.height for row in rows], dtype=np.int64),
+        params=np.array([value for row in rows for value in row.params], dtype=np.float64),
+        param_offsets=offsets_of([len(row.params) for row in rows]),
+    )
+
+
+def image_columns(images: Sequence[RawImage]) -> RawImages:
+    """Return the images as columns, sorted by id."""
+    rows = sorted(images, key=lambda image: image.image_id)
+    no_ids, no_xy, no_idx = np.empty(0, np.uint64), np.empty((0, 2)), np.empty(0, np.int64)
+    return RawImages(
+        image_id=np.array([row.image_id for row in rows], dtype=np.uint32),
+        name=tuple(row.name for row in rows),
+        camera_id=np.array([row.camera_id for row in rows], dtype=np.uint32),
+        poses=np.array([row.pose for row in rows], dtype=np.float64).reshape(-1, 7),
+        num_points2d=np.array([row.num_points2d for row in rows], dtype=np.int64),
+        offsets=offsets_of([len(row.point3d_id) for row in rows]),
+        point2d_idx=np.concatenate([no_idx, *(row.point2d_idx for row in rows)]),
+        xy_px=np.concatenate([no_xy, *(row.xy_px for row in rows)]),
+        point3d_id=np.concatenate([no_ids, *(row.point3d_id for row in rows)]),
+    )
+
+
+def offsets_of(lengths: Sequence[int] | IntArray) -> IntArray:
+    """Return (n + 1,) offsets of n slices of the given lengths."""
+    offsets = np.zeros(len(lengths) + 1, dtype=np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    return offsets
+
+
+def order_of_points(path: InputPath, point3d_id: UInt64Array, position: Callable[[int], Position]) -> IntArray:
+    """Return the permutation that sorts ``point3d_id``.
+
+    Raises
+    ------
+    MalformedFileError
+        Where an id occurs twice; ``position`` tells where in the file a row lies.
+    """
+    if bool(np.all(point3d_id[1:] > point3d_id[:-1])):
+        return np.arange(len(point3d_id), dtype=np.int64)
+    order = np.argsort(point3d_id, kind="stable")
+    ids = point3d_id[order]
+    repeated = np.flatnonzero(ids[1:] == ids[:-1])
+    if len(repeated):
+        row = int(order[repeated + 1].min())
+        raise duplicate_id(path, position(row), "3D point", int(point3d_id[row]))
+    return order
+
+
+def duplicate_id(path: InputPath, position: Position, kind: str, item_id: int) -> MalformedFileError:
+    """Return the error for an id that the file has used before."""
+    wanted = f"a {kind} id that the file has not used before"
+    return MalformedFileError(str(path), position, wanted, f"id {item_id} again", "export the reconstruction again")
+
+
+def check_camera(path: InputPath, position: Position, camera: RawCamera) -> None:
+    """Raise MalformedFileError where the size of ``camera`` does not fit the 32 bits that the tables give it."""
+    if max(camera.width, camera.height) >= 2**32:
+        got = f"{camera.width} x {camera.height}"
+        advice = "export the reconstruction again"
+        raise MalformedFileError(str(path), position, "an image size below 2^32 px", got, advice)

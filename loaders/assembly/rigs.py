@@ -1,0 +1,114 @@
+"""Poses of images from frames and rigs (COLMAP 3.12 and newer)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, Pose, RawFrame, RawImages, RawRig
+from sfm_audit.loaders.model import Finding, FindingCode
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FramePoses:
+    """Per image: sensor_from_rig and rig_from_world, and why an image has none."""
+
+    rows: list[int]
+    sensor_from_rig: list[Pose]
+    rig_from_world: list[Pose]
+    problems: dict[int, str]
+
+
+def compose(cam_from_rig: FloatArray, rig_from_world: FloatArray) -> FloatArray:
+    """Return (n, 7) poses cam_from_rig * rig_from_world.
+
+    Quaternions are multiplied as stored (Hamilton product), not normalised; the translation of the right factor is
+    turned by the left quaternion the way Eigen does it: v + 2 w (q x v) + 2 q x (q x v). COLMAP: Rigid3d operator*.
+    """
+    a_w, a_q, a_t = cam_from_rig[:, :1], cam_from_rig[:, 1:4], cam_from_rig[:, 4:]
+    b_w, b_q, b_t = rig_from_world[:, :1], rig_from_world[:, 1:4], rig_from_world[:, 4:]
+    w = a_w * b_w - np.sum(a_q * b_q, axis=1, keepdims=True)
+    q = a_w * b_q + b_w * a_q + np.cross(a_q, b_q)
+    twice = 2 * np.cross(a_q, b_t)
+    return np.hstack([w, q, b_t + a_w * twice + np.cross(a_q, twice) + a_t])
+
+
+def compose_poses(
+    images: RawImages, rigs: Sequence[RawRig] | None, frames: Sequence[RawFrame] | None
+) -> tuple[FloatArray, tuple[Finding, ...]]:
+    """Return (I, 7) cam_from_world of all images.
+
+    With rigs and frames the poses of the images file are ignored, as in COLMAP. An image that they do not place
+    keeps the pose of the images file, and a finding says so.
+    """
+    if rigs is None or frames is None:
+        return images.poses, _one_file_missing(rigs, frames)
+    if not rigs and not frames:
+        return images.poses, ()
+    parts = _frame_poses(images, rigs, frames)
+    poses = images.poses.copy()
+    if parts.rows:
+        with np.errstate(invalid="ignore", over="ignore"):  # a non-finite pose is a finding, not an error
+            poses[parts.rows] = compose(np.array(parts.sensor_from_rig), np.array(parts.rig_from_world))
+    return poses, _not_placed(images, parts.problems) + _not_there(images, frames)
+
+
+def _frame_poses(images: RawImages, rigs: Sequence[RawRig], frames: Sequence[RawFrame]) -> _FramePoses:
+    rig_of = {rig.rig_id: rig for rig in rigs}
+    frames_of: dict[int, list[RawFrame]] = {}
+    for frame in frames:
+        for image_id in frame.image_ids:
+            frames_of.setdefault(image_id, []).append(frame)
+    parts = _FramePoses([], [], [], {})
+    ids = zip(images.image_id.tolist(), images.camera_id.tolist(), strict=True)
+    for row, (image_id, camera_id) in enumerate(ids):
+        owners = frames_of.get(image_id, [])
+        rig = rig_of.get(owners[0].rig_id) if owners else None
+        sensor = (CAMERA_SENSOR, camera_id)
+        if len(owners) != 1:
+            parts.problems[row] = f"is in {len(owners)} frames" if owners else "is in no frame"
+        elif rig is None:
+            parts.problems[row] = f"is in a frame of rig {owners[0].rig_id}, which does not exist"
+        elif sensor not in rig.sensor_from_rig:
+            parts.problems[row] = f"has camera {camera_id}, which is not in rig {rig.rig_id}"
+        else:
+            sensor_from_rig = rig.sensor_from_rig[sensor]
+            if sensor_from_rig is None:
+                parts.problems[row] = f"has camera {camera_id}, which has no pose in rig {rig.rig_id}"
+            else:
+                parts.rows.append(row)
+                parts.sensor_from_rig.append(sensor_from_rig)
+                parts.rig_from_world.append(owners[0].rig_from_world)
+    return parts
+
+
+def _not_placed(images: RawImages, problems: dict[int, str]) -> tuple[Finding, ...]:
+    if not problems:
+        return ()
+    row, problem = next(iter(problems.items()))
+    count = len(problems)
+    text = (
+        f"{count} of {len(images.image_id)} images are not placed by rigs and frames and keep the pose of the images "
+        f"file, e.g. image {images.image_id[row]} {problem}"
+    )
+    return (Finding(FindingCode.INCOMPLETE_RIGS, count, text),)
+
+
+def _not_there(images: RawImages, frames: Sequence[RawFrame]) -> tuple[Finding, ...]:
+    known = set(images.image_id.tolist())
+    lost = sorted({image_id for frame in frames for image_id in frame.image_ids} - known)
+    if not lost:
+        return ()
+    text = f"frames consist of {len(lost)} images that do not exist, e.g. image {lost[0]}"
+    return (Finding(FindingCode.INCOMPLETE_RIGS, len(lost), text),)
+
+
+def _one_file_missing(rigs: Sequence[RawRig] | None, frames: Sequence[RawFrame] | None) -> tuple[Finding, ...]:
+    if rigs is None and frames is None:
+        return ()
+    there, missing = ("frames", "rigs") if rigs is None else ("rigs", "frames")
+    text = f"there is a {there} file and no {missing} file, so all poses are those of the images file"
+    return (Finding(FindingCode.INCOMPLETE_RIGS, 1, text),)

@@ -1,0 +1,1 @@
+"""COLMAP model folders, binary and text, and its database."""

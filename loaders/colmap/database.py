@@ -1,0 +1,179 @@
+"""Keypoint scales and orientations from COLMAP's database.db, for the observations of a model.
+
+Tables read (COLMAP 4.2, src/colmap/scene/database_sqlite.cc): ``images`` (image_id, name) and ``keypoints`` (image_id,
+rows, cols, data), data = rows x cols float32, row-major, little-endian.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeVar
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.errors import LoadError, MalformedFileError, TruncatedFileError, UnreadableFileError
+from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.paths.files import exists, open_input
+from sfm_audit.loaders.paths.locations import RemotePath, parse_location
+
+DATABASE_NAME: Final = "database.db"
+_LEVELS_UP: Final = 3
+_MAGIC: Final = b"SQLite format 3\0"
+_HEADER_BYTES: Final = 100
+_QUERY: Final = (
+    "SELECT images.image_id, keypoints.rows, keypoints.cols, keypoints.data "
+    "FROM images LEFT JOIN keypoints ON keypoints.image_id = images.image_id WHERE images.name = ?"
+)
+_OTHER_DATABASE: Final = "give the database that this model was made from, or choose another noise model"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeypointShapes:
+    """Scale and orientation of each linked 2D point; row i of every array is row i of ``SparseModel.observations``.
+
+    location: the database.    scale_px: (M,) px, as COLMAP's ``FeatureKeypoint::ComputeScale``.
+    orientation_rad: (M,) rad, as its ``ComputeOrientation``.    Both NaN where the database stores positions only.
+    """
+
+    location: str
+    scale_px: FloatArray
+    orientation_rad: FloatArray
+
+
+def find_database(model_location: str | Path) -> Path | None:
+    """Return the ``database.db`` beside a model or at most three folders above it, the nearest one; None without.
+
+    MegaDepth keeps it in ``<scene>/`` and its models in ``<scene>/sparse/manhattan/<k>/``: three folders above.
+
+    Raises
+    ------
+    UnreadableFileError
+        The model lies in an object store: SQLite reads files of this machine.
+    """
+    folder = parse_location(model_location)
+    if isinstance(folder, RemotePath):
+        wanted, advice = "a model on this machine, for its database.db", "copy the scene, or use --noise track"
+        raise UnreadableFileError(str(folder), None, wanted, "one in an object store", advice)
+    folder = folder.absolute()
+    for candidate in (folder, *folder.parents[:_LEVELS_UP]):
+        path = candidate / DATABASE_NAME
+        if exists(path):
+            return path
+    return None
+
+
+def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes:
+    """Read the keypoint scales of a model's observations from the database it was made from.
+
+    Parameters
+    ----------
+    path : the SQLite file, opened read-only; nothing is written, not even a lock
+    model : its images are looked up by *name* and their 2D points by position: image ids of database and model may
+        differ (models that were merged, renumbered or exported), names and the order of POINTS2D do not
+
+    Returns
+    -------
+    KeypointShapes
+        NaN for images whose keypoints have two columns (positions only, as learned features are often stored).
+
+    Raises
+    ------
+    LoadError
+        MissingFileError, LfsPointerError, UnreadableFileError, TruncatedFileError as for every input;
+        MalformedFileError where the file is no SQLite database, lacks the tables, or a blob's size disagrees with its
+        rows and columns; LoadError where an image of the model is not in it, or has another number of keypoints.
+
+    Notes
+    -----
+    Two columns: x, y. Four: x, y, scale, orientation. Six: x, y, a11, a12, a21, a22, then
+    scale = (|(a11, a21)| + |(a12, a22)|) / 2 and orientation = atan2(a21, a11)
+    (COLMAP 4.2, src/colmap/feature/types.cc).
+    """
+    path = Path(path)
+    _check_file(path)
+    images, observations = model.images, model.observations
+    scale = np.full(len(observations), np.nan)
+    orientation = np.full(len(observations), np.nan)
+    with closing(
+        _asked(path, lambda: sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True))
+    ) as db:
+        for image_idx, name in enumerate(images.name):
+            keypoints = _keypoints_of(path, db, name, int(images.num_points2d[image_idx]))
+            rows = slice(*observations.offsets[image_idx : image_idx + 2])
+            linked = keypoints[observations.point2d_idx[rows], 2:].astype(np.float64)
+            scale[rows], orientation[rows] = _shape_of(linked)
+    return KeypointShapes(str(path), scale, orientation)
+
+
+def _shape_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scale, px, and orientation, rad, (m,) each, from the columns after x and y: none, two or four."""
+    if columns.shape[1] == 0:
+        unknown = np.full(len(columns), np.nan)
+        return unknown, unknown
+    if columns.shape[1] == 2:
+        return columns[:, 0], columns[:, 1]
+    a11, a12, a21, a22 = columns.T
+    return 0.5 * (np.hypot(a11, a21) + np.hypot(a12, a22)), np.arctan2(a21, a11)
+
+
+def _keypoints_of(
+    path: Path, db: sqlite3.Connection, name: str, num_points2d: int
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    """Return the (num_points2d, 2 | 4 | 6) keypoints of the image called ``name``."""
+    found = _asked(path, lambda: db.execute(_QUERY, (name,)).fetchone())
+    if found is None:
+        raise LoadError(str(path), None, f"the image {name!r} of the model", "no image of that name", _OTHER_DATABASE)
+    image_id, rows, cols, data = found
+    if rows is None:  # the image has no row in the table of keypoints
+        rows, cols, data = 0, 2, b""
+    where = f"keypoints of image {image_id} ({name!r})"
+    if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols in {2, 4, 6}):
+        raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r} rows and {cols!r} columns")
+    data = data or b""
+    if not isinstance(data, bytes) or len(data) != rows * cols * 4:
+        got = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
+        raise _malformed(path, f"{where} in {rows * cols * 4} bytes ({rows} x {cols} float32)", got)
+    if rows != num_points2d:
+        raise LoadError(str(path), None, f"{num_points2d} {where}, as in the model", f"{rows}", _OTHER_DATABASE)
+    return np.frombuffer(data, dtype="<f4").reshape(rows, cols)
+
+
+def _check_file(path: Path) -> None:
+    """Raise unless ``path`` is a whole SQLite database that nobody is writing to.
+
+    A database cut short opens without complaint and fails only where a page is missing, so its size is compared with
+    the header's (https://www.sqlite.org/fileformat.html#the_database_header).
+    """
+    file, size = open_input(path)
+    with file:
+        header = file.read(_HEADER_BYTES)
+    if header[: len(_MAGIC)] != _MAGIC[: len(header)]:
+        raise _malformed(path, "a SQLite database", f"a file that starts with {header[:16]!r}")
+    page_bytes = int.from_bytes(header[16:18], "big")
+    page_bytes = 65536 if page_bytes == 1 else page_bytes
+    wanted = max(_HEADER_BYTES, page_bytes * int.from_bytes(header[28:32], "big"))
+    if size < wanted:
+        raise TruncatedFileError(str(path), None, f"{wanted} bytes, as its header says", f"{size}", "copy it again")
+    log = path.with_name(f"{path.name}-wal")
+    if log.is_file() and log.stat().st_size:  # an immutable connection would not see what is in there
+        advice = "end the program that has the database open, or open it once with sqlite3 to take the log in"
+        raise UnreadableFileError(str(path), None, "a database that is not in use", f"changes in {log.name}", advice)
+
+
+def _asked(path: Path, question: Callable[[], T]) -> T:
+    """Return the answer of SQLite, whose complaints (of damaged tables, in damaged letters) become a LoadError."""
+    try:
+        return question()
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise _malformed(path, "COLMAP's tables of images and keypoints", str(error)) from error
+
+
+def _malformed(path: Path, wanted: str, got: str) -> MalformedFileError:
+    return MalformedFileError(str(path), None, wanted, got, "export the database again, or choose another noise model")

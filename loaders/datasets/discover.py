@@ -1,0 +1,249 @@
+"""Which models lie below the paths a user gives, and what they are called: dataset, scene, component."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from sfm_audit.loaders.colmap.folder import REQUIRED, SUFFIX
+from sfm_audit.loaders.datasets.input_state import NAMES, model_files_in, size_of, stamp_of
+from sfm_audit.loaders.datasets.layouts import (
+    LAYOUTS,
+    ONLY_COMPONENT,
+    Layout,
+    Parts,
+    Place,
+    distinct,
+    folders_to_search,
+    place_of,
+    without_copies,
+)
+from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
+from sfm_audit.loaders.paths.files import exists, is_folder
+from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
+
+_MODEL_FILES: Final = frozenset(f"{name}{suffix}" for name in REQUIRED for suffix in SUFFIX.values())
+_REQUESTS_AT_ONCE: Final = 16  # to an object store: its answers take their time, and not this machine's
+_EXAMPLES: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRef:
+    """One model folder and its place in a data set.
+
+    dataset: base name of the path the user gave.    scene, component: by the folder names, see `layouts`.
+    location: real absolute path, or URI.    model_path: the path as given, joined with the path below it.
+    num_bytes: size of the files that the model is read from.
+    stamp: `input_stamp` when the model was found in an object store; empty for local models, which
+    are asked again at no cost.
+    """
+
+    dataset: str
+    scene: str
+    component: str
+    location: str
+    model_path: str
+    num_bytes: int = field(default=0, compare=False)
+    stamp: str = field(default="", compare=False, repr=False)
+
+    @property
+    def key(self) -> str:
+        """Name of the model's part in a run folder: 16 hex digits that depend on the location alone."""
+        return hashlib.sha256(os.fsencode(self.location)).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """The models found, sorted by dataset, scene, component and location, and the paths in which there are none.
+
+    left_out: models that were found and not asked for, by another layout than the one wanted or `selection`.
+    """
+
+    refs: tuple[ModelRef, ...]
+    errors: tuple[LoadError, ...]
+    left_out: tuple[ModelRef, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A model folder: the names that lead from the root to it, its size and its stamp."""
+
+    parts: Parts
+    num_bytes: int
+    stamp: str = ""
+
+
+def discover(paths: Sequence[str | Path], layout: str | None = None) -> Discovery:
+    """Find all models at and below ``paths``.
+
+    A folder that holds any of COLMAP's model files counts as a model, so that a broken one is reported when it is
+    opened instead of vanishing; nothing below it is searched, but hloc's ``models``. Hidden folders are skipped, links
+    are followed, loops are not. A model that several paths lead to is named once, after the first of them. Of D2-Net's
+    two copies of a model the binary one is taken.
+
+    Parameters
+    ----------
+    paths : model folders, their parents, or data set roots; of this machine, or s3://..., gs://...
+    layout : a name in `layouts.LAYOUTS`: models elsewhere are left out; None: every model by the first layout
+        that knows its folder's names
+
+    Returns
+    -------
+    Discovery
+        The models in a fixed order. A path that does not exist, cannot be searched or holds no model becomes an
+        entry of ``errors`` and does not hide the others.
+    """
+    wanted = None if layout is None else LAYOUTS[layout]
+    refs: dict[str, ModelRef] = {}
+    left_out: dict[str, ModelRef] = {}
+    errors: list[LoadError] = []
+    for path in paths:
+        found = _models_below(path, wanted)
+        errors += found.errors
+        for ref in found.refs:
+            refs.setdefault(ref.location, ref)
+        for ref in found.left_out:
+            left_out.setdefault(ref.location, ref)
+    return Discovery(
+        in_order(refs.values()),
+        tuple(errors),
+        in_order(ref for location, ref in left_out.items() if location not in refs),
+    )
+
+
+def in_order(refs: Iterable[ModelRef]) -> tuple[ModelRef, ...]:
+    """Return models in the order that everything is written in."""
+    return tuple(sorted(refs, key=lambda ref: (ref.dataset, ref.scene, ref.component, ref.location)))
+
+
+def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
+    try:
+        root = parse_location(given)
+    except LoadError as error:
+        return Discovery((), (error,))
+    try:
+        _check_root(root)
+        found, errors = _search(root, layout)
+    except LoadError as error:  # named as the user typed it
+        return Discovery((), (type(error)(str(given), error.position, error.wanted, error.got, error.advice),))
+    named_parts = root.parts if isinstance(root, RemotePath) else _named_parts(root)
+    dataset = named_parts[-1] if named_parts else str(root)
+    places = {each.parts: place_of(named_parts + each.parts, layout) for each in found}
+    known = distinct(without_copies({parts: place for parts, place in places.items() if place}, layout))
+    refs, left_out = [], []
+    for each in found:
+        model_path = below(str(given), each.parts)
+        place = known.get(each.parts)
+        if place:
+            refs.append(_ref(dataset, place, model_path, each))
+        elif places[each.parts] is None:
+            other = place_of(named_parts + each.parts) or Place("", ONLY_COMPONENT, 0)
+            left_out.append(_ref(dataset, other, model_path, each))
+    if not refs and not errors:
+        errors.append(_nothing_found(str(given), left_out, layout))
+    return Discovery(tuple(refs), tuple(errors), tuple(left_out))
+
+
+def _check_root(root: InputPath) -> None:
+    """Raise unless ``root`` is a folder; a listing says more than a question (no such bucket), so it comes first."""
+    if (isinstance(root, RemotePath) and root.listing) or is_folder(root):
+        return
+    if exists(root.resolve() if isinstance(root, Path) else root):
+        raise UnreadableFileError(str(root), None, "a folder", "a file", "name the folder that holds the model")
+    raise MissingFileError(str(root), None, "a folder", "nothing", "check the path")
+
+
+def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef:
+    return ModelRef(
+        dataset, place.scene, place.component, real_location(model_path), model_path, found.num_bytes, found.stamp
+    )
+
+
+def _nothing_found(given: str, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:
+    if layout is None or not left_out:
+        wanted, got = "a model folder at or below it", "no cameras, images or points3D file"
+        return MissingFileError(given, None, wanted, got, "name a folder that holds COLMAP models")
+    examples = ", ".join(ref.model_path for ref in left_out[:_EXAMPLES])
+    return MissingFileError(
+        given,
+        None,
+        f"models laid out as {layout.name} has them ({layout.pattern})",
+        f"{len(left_out)} elsewhere: {examples}{', ...' if len(left_out) > _EXAMPLES else ''}",
+        "leave out --layout, or name another one",
+    )
+
+
+def _named_parts(root: Path) -> Parts:
+    """Return the names that lead to ``root`` from the file system's root: as typed, "." and ".." resolved."""
+    return Path(os.path.abspath(root)).parts[1:]  # noqa: PTH100 - resolve() would replace a link by what it names
+
+
+def scene_and_component(parts: Parts) -> tuple[str, str]:
+    """Return what the model in the folder with these path parts is called."""
+    place = place_of(parts)
+    return (place.scene, place.component) if place else ("", ONLY_COMPONENT)
+
+
+def _search(root: InputPath, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
+    """Return the model folders at and below ``root``, and what cannot be searched."""
+    return _search_remote(root, layout) if isinstance(root, RemotePath) else _search_local(root, layout)
+
+
+def _search_local(root: Path, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
+    found: list[_Found] = []
+    errors: list[LoadError] = []
+    visited: set[str] = set()
+    root_parts = _named_parts(root)
+
+    def note(error: OSError) -> None:
+        got = error.strerror or type(error).__name__
+        errors.append(UnreadableFileError(str(error.filename), None, "a readable folder", got, "check its permissions"))
+
+    for folder, folders, files in os.walk(root, followlinks=True, onerror=note):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders[:] = []
+            continue
+        visited.add(real)
+        parts = Path(folder).relative_to(root).parts
+        is_model = not _MODEL_FILES.isdisjoint(files) or not _MODEL_FILES.isdisjoint(folders)
+        if is_model:
+            found.append(_Found(parts, size_of(model_files_in(Path(folder)))))
+        folders[:] = folders_to_search(root_parts + parts, folders, is_model=is_model, layout=layout)
+    return found, errors
+
+
+def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
+    """Ask level by level, many folders at once."""
+    found: list[_Found] = []
+    errors: list[LoadError] = []
+    level: list[tuple[Parts, RemotePath]] = [((), root)]
+    with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
+        while level:
+            asked = list(pool.map(lambda each: _listing_or_error(each[1]), level))
+            below_it: list[tuple[Parts, RemotePath]] = []
+            for (parts, folder), listing in zip(level, asked, strict=True):
+                if isinstance(listing, LoadError):
+                    errors.append(listing)
+                    continue
+                is_model = not _MODEL_FILES.isdisjoint(listing)
+                if is_model:
+                    files = {name: listing[name] for name in NAMES if name in listing}
+                    found.append(_Found(parts, size_of(files), stamp_of(files)))
+                folders = [name for name, entry in listing.items() if entry.is_folder]
+                folders = folders_to_search(folder.parts, folders, is_model=is_model, layout=layout)
+                below_it += [((*parts, name), replace(folder, parts=(*folder.parts, name))) for name in folders]
+            level = below_it
+    return sorted(found, key=lambda each: each.parts), errors
+
+
+def _listing_or_error(folder: RemotePath) -> Mapping[str, Entry] | LoadError:
+    try:
+        return folder.listing
+    except LoadError as error:
+        return error

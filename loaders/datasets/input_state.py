@@ -1,0 +1,89 @@
+"""Did the files of a model change since they were audited? Sizes and times first, content when those differ."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from stat import S_ISDIR
+from typing import Final
+
+from sfm_audit.loaders.colmap.folder import OPTIONAL, REQUIRED, SUFFIX
+from sfm_audit.loaders.datasets.fingerprint import files_in
+from sfm_audit.loaders.errors import LoadError
+from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, parse_location
+
+NAMES: Final = tuple(f"{stem}{suffix}" for stem in (*REQUIRED, *OPTIONAL) for suffix in SUFFIX.values())
+
+
+@dataclass(frozen=True, slots=True)
+class InputState:
+    """The files of one model at one moment.
+
+    num_bytes : size of the files that the model is read from
+    stamp : names, sizes and times of change of all files in the folder that can matter; equal: nothing was touched
+    digest : SHA-256 over the content of the files that the model is read from (and the stamps of the others)
+    """
+
+    num_bytes: int
+    stamp: str
+    digest: str
+
+
+def input_stamp(location: str) -> str:
+    """Return the cheap part of the state; empty where there are no model files."""
+    return stamp_of(model_files_in(parse_location(location)))
+
+
+def read_input_state(location: str) -> InputState:
+    """Read all files of the model in the folder ``location`` and return their state.
+
+    Raises
+    ------
+    LoadError
+        Where a file is missing or cannot be read.
+    """
+    folder = parse_location(location)
+    found = model_files_in(folder)  # before the content: a file that changes in between counts as changed next time
+    files = files_in(folder)
+    read = {file.name for file in files}
+    parts = [f"{file.name}:{file.sha256}" for file in files]
+    parts += [stamp_of({name: there}) for name, there in found.items() if name not in read]
+    digest = hashlib.sha256(" ".join(parts).encode()).hexdigest()
+    return InputState(sum(file.num_bytes for file in files), stamp_of(found), digest)
+
+
+def input_size(location: str) -> int:
+    """Return the size in bytes of the files that the model is read from, 0 where there are none."""
+    return size_of(model_files_in(parse_location(location)))
+
+
+def stamp_of(files: Mapping[str, Entry]) -> str:
+    """Return names, sizes and times of change of model files as one string."""
+    return " ".join(f"{name}:{there.num_bytes}:{there.mtime_ns}" for name, there in files.items())
+
+
+def size_of(files: Mapping[str, Entry]) -> int:
+    """Return the size in bytes of the files that `loaders.open_model` would read of these."""
+    for suffix in SUFFIX.values():
+        if all(f"{stem}{suffix}" in files for stem in REQUIRED):
+            return sum(there.num_bytes for name, there in files.items() if name.endswith(suffix))
+    return sum(there.num_bytes for there in files.values())
+
+
+def model_files_in(folder: InputPath) -> dict[str, Entry]:
+    """Return the files of ``folder`` that can matter to its model, in a fixed order; none where it cannot be read."""
+    if isinstance(folder, RemotePath):
+        try:
+            listing = folder.listing
+        except LoadError:
+            return {}  # opening the model says what is wrong
+        return {name: listing[name] for name in NAMES if name in listing}
+    files = {}
+    for name in NAMES:
+        try:
+            stat = (folder / name).stat()
+        except OSError:
+            continue  # not there, or not to be read: opening the model says which
+        files[name] = Entry(is_folder=S_ISDIR(stat.st_mode), num_bytes=stat.st_size, mtime_ns=stat.st_mtime_ns)
+    return files

@@ -1,0 +1,142 @@
+"""Text files line by line: comments, stated counts, line ends, and numbers that must be what they look like."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.errors import MalformedFileError, Position, TruncatedFileError
+from sfm_audit.loaders.model import Finding, FindingCode
+from sfm_audit.loaders.paths.files import read_bytes
+from sfm_audit.loaders.paths.locations import InputPath
+
+_STATED_COUNT: Final = re.compile(rb"#\s*Number of (?:cameras|images|points|rigs|frames)\s*:\s*(\d{1,18})(?!\d)")
+POINTS: Final = "3D points"
+_BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
+_ADVICE: Final = "check that this is COLMAP's text format, or export the reconstruction again"
+_RECOPY: Final = "copy or export the reconstruction again"
+
+
+@dataclass(frozen=True, slots=True)
+class TextFile:
+    """The lines of one file; ``stated_count`` is what its comment "# Number of ...: N" says, None without one.
+
+    advice: what to do about a line that is not what it should be.
+    """
+
+    path: InputPath
+    lines: list[bytes]
+    stated_count: int | None
+    is_terminated: bool
+    advice: str = _ADVICE
+
+    def records(self) -> Iterator[tuple[int, bytes]]:
+        """Yield line numbers (from 1) and lines that are neither blank nor comments, without surrounding blanks."""
+        for number, line in enumerate(self.lines, start=1):
+            stripped = line.strip()
+            if stripped and not stripped.startswith(b"#"):
+                yield number, stripped
+
+    def malformed(self, line: int, wanted: str, got: str) -> MalformedFileError:
+        """Return the error for a line that is not what it should be."""
+        return MalformedFileError(str(self.path), Position("line", line), wanted, got, self.advice)
+
+    def truncated(self, wanted: str, got: str) -> TruncatedFileError:
+        """Return the error for a file that ends too early."""
+        return TruncatedFileError(str(self.path), Position("line", len(self.lines)), wanted, got, _RECOPY)
+
+
+def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
+    """Read a text file; errors as of `loaders.paths.files.open_input`, and MalformedFileError where it is no text."""
+    data = read_bytes(path).removeprefix(_BYTE_ORDER_MARK)
+    nul = data.find(b"\0")
+    if nul >= 0:
+        line = data.count(b"\n", 0, nul) + 1
+        raise MalformedFileError(str(path), Position("line", line), "text", "a NUL byte", advice)
+    lines = data.split(b"\n")
+    is_terminated = not lines[-1]
+    if is_terminated:
+        lines.pop()
+    comments = (line for line in lines if line.lstrip().startswith(b"#"))
+    stated = next((match for line in comments if (match := _STATED_COUNT.match(line.lstrip()))), None)
+    return TextFile(path, lines, int(stated[1]) if stated else None, is_terminated, advice)
+
+
+def check_count(
+    file: TextFile, kind: str, count: int, *, has_missing: Callable[[], bool], needs_line_end: bool = True
+) -> tuple[Finding, ...]:
+    """Compare the number of records with what the file says of itself.
+
+    COLMAP and most other writers state the count in a comment and end every line. A file that states more records
+    than it holds was cut, or its comment is wrong (public models have such comments): cut, if it holds none, or if
+    the other files refer to a record that it does not hold. A cut inside the last number of the last line leaves a
+    shorter, valid number; so a file that states its count, or holds no record, must also end its last line.
+
+    Parameters
+    ----------
+    file, kind, count : the file, what it lists, and how many of them were read
+    has_missing : whether other files refer to records that the file lacks; asked only where that matters
+    needs_line_end : False for a file that people edit by hand: an unended line is a finding there, not an error
+
+    Raises
+    ------
+    TruncatedFileError
+        Where the file was cut.
+    """
+    stated = file.stated_count
+    if count == 0 and stated is None and kind != POINTS:
+        raise file.truncated(kind, "none, and no comment that says there are none")
+    if not file.is_terminated and needs_line_end and (stated is not None or count == 0):
+        raise file.truncated("a line end after the last line", "none, so its last number may be cut")
+    is_short = stated is not None and count < stated
+    if (is_short and count == 0) or ((is_short or (count == 0 and stated is None)) and has_missing()):
+        wanted = f"{stated} {kind}, as its own comment says" if is_short else f"the {kind} that other files refer to"
+        raise file.truncated(wanted, f"{count}")
+    findings: list[Finding] = []
+    if stated is not None and count != stated:
+        text = f"{file.path.name} says that it holds {stated} {kind}, and holds {count}"
+        findings.append(Finding(FindingCode.STATED_COUNT_DIFFERS, abs(count - stated), text))
+    if not file.is_terminated:
+        text = f"{file.path.name} does not end its last line: its last number may be cut"
+        findings.append(Finding(FindingCode.UNTERMINATED_TEXT, 1, text))
+    return tuple(findings)
+
+
+def parse_uint(file: TextFile, line: int, token: bytes, what: str, bits: int = 32) -> int:
+    """Return the unsigned integer that ``token`` spells; never by way of a float."""
+    if not token.isdigit() or len(token) > 20 or int(token) >= 2**bits:
+        raise file.malformed(line, f"{what} (a whole number below 2^{bits})", repr_token(token))
+    return int(token)
+
+
+def parse_floats(file: TextFile, line: int, tokens: list[bytes], what: str) -> FloatArray:
+    """Return the numbers that ``tokens`` spell; NaN and infinities are numbers here."""
+    has_underscore = any(b"_" in token for token in tokens)  # Python reads 1_0 as 10
+    try:
+        values = np.array(tokens, dtype=np.float64)
+    except ValueError:
+        values = None
+    if values is None or has_underscore:
+        wrong = next(token for token in tokens if not is_number(token))
+        raise file.malformed(line, f"{what}, numbers", repr_token(wrong))
+    return values
+
+
+def is_number(token: bytes) -> bool:
+    """Whether ``token`` spells a number, NaN and infinities included."""
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return b"_" not in token
+
+
+def repr_token(token: bytes) -> str:
+    """Return ``token`` as an error message shows it."""
+    text = token[:40].decode("utf-8", errors="backslashreplace")
+    return f"'{text}...'" if len(token) > 40 else f"'{text}'"

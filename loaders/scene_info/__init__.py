@@ -1,0 +1,1 @@
+"""Benchmark scene_info files, read without executing what they hold."""

@@ -1,0 +1,1 @@
+"""What changed between two runs, and does it pass a gate? For nightly checks."""

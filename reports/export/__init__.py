@@ -1,0 +1,1 @@
+"""Lists, models and benchmark files without the rejected images."""

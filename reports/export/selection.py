@@ -1,0 +1,171 @@
+r"""Which images does a run leave? Lists of their names, and tables of the others with the reasons.
+
+A line of a list is an image's name as it is. A name that would not stay on its line is written as a JSON string in
+double quotes instead: names with control characters or line ends, with blanks at an end, names that begin with a double
+quote, and the empty name. So a line that begins with a double quote is always a JSON string, and any other never.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+from sfm_audit.loaders import ModelRef
+from sfm_audit.loaders.datasets.input_state import read_input_state
+from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.run_folder.reader import RunReader
+
+COLUMNS: Final = (
+    "dataset",
+    "scene",
+    "component",
+    "model_path",
+    "image_id",
+    "image_name",
+    "verdict",
+    "reasons",
+)
+_UNWRITABLE: Final = frozenset({"Cc", "Cs", "Zl", "Zp"})  # control characters, lone surrogates, line and paragraph ends
+
+
+class Keep(StrEnum):
+    """Which images stay: all that were not rejected, or only those that were accepted."""
+
+    NOT_REJECTED = "not-rejected"
+    ACCEPTED = "accepted"
+
+
+@dataclass(frozen=True, slots=True)
+class AuditedImage:
+    """One image of a run: what it is called, and what the audit said."""
+
+    dataset: str
+    scene: str
+    component: str
+    model_path: str
+    image_id: int
+    image_name: str
+    verdict: str
+    reasons: tuple[str, ...]
+
+    @property
+    def model(self) -> str:
+        """``scene/component``, as lists name a model."""
+        return f"{self.scene}/{self.component}"
+
+    def is_kept(self, keep: Keep) -> bool:
+        """Whether the image stays."""
+        return self.verdict == "accepted" if keep is Keep.ACCEPTED else self.verdict != "rejected"
+
+
+def read_images(run: RunReader) -> tuple[AuditedImage, ...]:
+    """Return the images of a finished run, by model and id.
+
+    Raises
+    ------
+    RunFolderError
+        The run was not finished, so that a list made from it would lack whole models; or it holds no model.
+    """
+    if run.info.get("status") != "complete":
+        raise RunFolderError(run.folder, "holds a run that was not finished", "give its command again first")
+    images = [AuditedImage(**{**row, "reasons": tuple(row["reasons"] or ())}) for row in run.rows("images", COLUMNS)]
+    if not images:
+        raise RunFolderError(run.folder, "holds no audited image", "run it over a dataset that can be read")
+    return tuple(
+        sorted(
+            images, key=lambda image: (image.dataset, image.scene, image.component, image.model_path, image.image_id)
+        )
+    )
+
+
+def images_of_model(run: RunReader, images: Sequence[AuditedImage], model: Path) -> tuple[AuditedImage, ...]:
+    """Return the images of the model in the folder ``model``: found by its location, else by its content.
+
+    Raises
+    ------
+    RunFolderError
+        The run holds no audit of it, or one of files that have changed since, or of several equal copies.
+    LoadError
+        The model's files cannot be read.
+    """
+    state = read_input_state(str(model))
+    key = ModelRef("", "", "", str(model.resolve()), str(model)).key
+    inputs: list[Mapping[str, Any]] = run.info.get("inputs", [])
+    found = [entry for entry in inputs if entry["part"] == f"part-{key}.parquet"]
+    if found and found[0]["sha256"] != state.digest:
+        problem = f"holds an audit of {model} from before its files changed"
+        raise RunFolderError(run.folder, problem, "run the audit again")
+    found = found or [entry for entry in inputs if entry["sha256"] == state.digest]
+    if len(found) != 1:
+        problem = f"holds {len(found) or 'no'} {'audits of copies' if found else 'audit'} of {model}"
+        known = ", ".join(str(entry["model_path"]) for entry in inputs[:3]) + (", ..." if len(inputs) > 3 else "")
+        raise RunFolderError(run.folder, problem, f"name one of its models ({known}), or audit this one first")
+    return tuple(image for image in images if image.model_path == found[0]["model_path"])
+
+
+def list_text(run: RunReader, images: Sequence[AuditedImage], keep: Keep) -> str:
+    """Return the kept images, one line each: ``name``, or ``scene/component<TAB>name`` of several models.
+
+    Raises
+    ------
+    RunFolderError
+        Two models of the run have the same scene and component, so that lines could not tell them apart.
+    """
+    path_of: dict[str, str] = {}
+    for image in images:
+        if path_of.setdefault(image.model, image.model_path) != image.model_path:
+            problem = f"holds two models called {image.model}: {path_of[image.model]} and {image.model_path}"
+            raise RunFolderError(run.folder, problem, "a list cannot tell them apart; audit them into two folders")
+    is_alone = len(run.info.get("inputs", path_of)) == 1
+    lines = [
+        quoted(image.image_name) if is_alone else f"{quoted(image.model)}\t{quoted(image.image_name)}"
+        for image in images
+        if image.is_kept(keep)
+    ]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def quoted(name: str) -> str:
+    """Return a name as a list has it: as it is, or as a JSON string where it would not stay on its line."""
+    is_plain = name and not name.startswith('"') and name == name.strip()
+    if is_plain and not any(unicodedata.category(c) in _UNWRITABLE for c in name):
+        return name
+    text = json.dumps(name, ensure_ascii=False)
+    return "".join(f"\\u{ord(c):04x}" if unicodedata.category(c) in _UNWRITABLE else c for c in text)
+
+
+def unquoted(field: str) -> str:
+    """Return the name that a field of a list stands for; ValueError where it begins with a quote and is no JSON."""
+    return str(json.loads(field)) if field.startswith('"') else field
+
+
+def removed_text(images: Iterable[AuditedImage], extra: Iterable[Mapping[str, object]] = ()) -> str:
+    """Return a CSV table of images with the reasons why they were removed; ``extra`` are columns put before, by row."""
+    extras = list(extra)
+    rows: list[dict[str, object]] = []
+    for position, image in enumerate(images):
+        own: dict[str, object] = {name: getattr(image, name) for name in COLUMNS}
+        own["reasons"] = "; ".join(image.reasons)
+        rows.append({**(extras[position] if extras else {}), **own})
+    return csv_text(rows, COLUMNS)
+
+
+def csv_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
+    """Return rows as CSV; a header line even where there is no row."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def as_bytes(text: str) -> bytes:
+    """Return a text as UTF-8; what UTF-8 cannot hold becomes its code."""
+    return text.encode("utf-8", errors="backslashreplace")

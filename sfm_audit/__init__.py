@@ -1,0 +1,78 @@
+"""Audit reconstructions: does the camera that each image claims explain its own inliers? This is the interface.
+
+Names are imported when they are first used: ``sfm-audit --help`` must not wait for SciPy. The
+folders ``audit``, ``loaders`` and ``reports`` of the repository are installed inside this package, so that one import
+name is taken; in a checkout they are links to the folders above.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from sfm_audit.audit.config import AuditConfig
+    from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict
+    from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
+    from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor
+    from sfm_audit.audit.engine.model import audit_model as audit_reconstruction
+    from sfm_audit.audit.table import ModelLabels
+    from sfm_audit.loaders.colmap.folder import open_model
+    from sfm_audit.loaders.errors import LoadError
+    from sfm_audit.loaders.model import SparseModel
+
+__all__ = [
+    "AuditConfig",
+    "ImageAudit",
+    "Judgement",
+    "LoadError",
+    "ModelAudit",
+    "ModelAuditor",
+    "ModelLabels",
+    "Reason",
+    "ReasonCode",
+    "SparseModel",
+    "Verdict",
+    "audit_inliers",
+    "audit_reconstruction",
+    "open_model",
+]
+
+_HOMES: Final = {
+    "AuditConfig": "audit.config",
+    "ImageAudit": "audit.engine.image",
+    "Judgement": "audit.decision.verdict",
+    "LoadError": "loaders.errors",
+    "ModelAudit": "audit.engine.model",
+    "ModelAuditor": "audit.engine.model",
+    "ModelLabels": "audit.table",
+    "Reason": "audit.decision.verdict",
+    "ReasonCode": "audit.decision.verdict",
+    "SparseModel": "loaders.model",
+    "Verdict": "audit.decision.verdict",
+    "audit_inliers": "audit.engine.image",
+    "audit_reconstruction": "audit.engine.model",
+    "open_model": "loaders.colmap.folder",
+}
+_RENAMED: Final = {"audit_reconstruction": "audit_model"}
+
+if not all((Path(__file__).parent / room).is_dir() for room in ("audit", "loaders", "reports")):
+    raise ImportError(
+        "sfm_audit: its folders audit, loaders and reports are links that this checkout does not have; "
+        "git config core.symlinks true && git checkout -- sfm_audit, or pip install a wheel"
+    )
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from the module it lives in."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+    value = getattr(module, _RENAMED.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
