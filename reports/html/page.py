@@ -76,7 +76,7 @@ def render_page(page: PageInput) -> str:
     """Return the page: one HTML document that asks for nothing outside itself."""
     content = page.content
     environment = Environment(
-        loader=PackageLoader("reports.html"),
+        loader=PackageLoader("sfm_audit.reports.html"),
         autoescape=select_autoescape(default=True, default_for_string=True),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -124,7 +124,7 @@ def _table_columns(content: RunContent) -> list[TableColumn]:
 
 
 def _asset(name: str) -> str:
-    return resources.files("reports.html").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("sfm_audit.reports.html").joinpath(name).read_text(encoding="utf-8")
 
 
 def _questions(content: RunContent) -> list[dict[str, Any]]:
