@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
-    from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict
+    from sfm_audit.audit.decision.decide import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
     from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor, audit_model
     from sfm_audit.audit.table import ModelLabels
+    from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
 
 __all__ = [
     "AuditConfig",
+    "Decision",
     "ImageAudit",
-    "Judgement",
     "ModelAudit",
     "ModelAuditor",
     "ModelLabels",
@@ -34,7 +35,8 @@ _HOMES: Final = {
     "sfm_audit.audit.engine.model": ("ModelAudit", "ModelAuditor", "audit_model"),
     "sfm_audit.audit.engine.image": ("ImageAudit", "audit_inliers"),
     "sfm_audit.audit.table": ("ModelLabels",),
-    "sfm_audit.audit.decision.verdict": ("Judgement", "Reason", "ReasonCode", "Verdict"),
+    "sfm_audit.audit.decision.decide": ("Decision",),
+    "sfm_audit.audit.table.words": ("Reason", "ReasonCode", "Verdict"),
 }
 
 

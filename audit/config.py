@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from sfm_audit.audit.table import thresholds
+from sfm_audit.audit.table.words import PolicyName
+
 NoiseName = Literal["track", "constant", "keypoint"]
 PointsName = Literal["in-sample", "independent"]
-PolicyName = Literal["full", "camera", "paper"]
 
 
 class AuditConfig(BaseModel):
@@ -28,30 +31,20 @@ class AuditConfig(BaseModel):
     )
     policy: PolicyName = Field(
         default="full",
-        description="which verdicts decide: paper = verdict_ks; camera = misfit, pose, plausible; full = all four",
+        description="which verdicts decide: standard = misfit, camera, pose, plausible, noise, outside; camera = the "
+        "first four; full = all; paper = verdict_ks",
     )
     min_effect: str = Field(
-        default="0.2px",
+        default=thresholds.MIN_EFFECT,
         pattern=r"^(\d+(\.\d*)?|\.\d+)(px|sigma)$",
         description="tau: a significant misfit below it does not reject; in px, or in sigma of the image (0.5sigma)",
     )
-    alpha: float = Field(
-        default=0.05,
-        gt=0,
-        lt=1,
-        description="level of the tests: an image is rejected when its p-value is below",
-    )
+    alpha: float = Field(default=thresholds.ALPHA.default, gt=0, lt=1, description=thresholds.ALPHA.meaning)
     min_ks_distance: float = Field(
-        default=0.0,
-        ge=0,
-        lt=1,
-        description="verdict_ks rejects only where D is larger too; 0 is the paper's decision, which with thousands of "
-        "observations an image rejects noise that is hardly different (0.03 asks for a visible difference)",
+        default=thresholds.MIN_KS_DISTANCE.default, ge=0, lt=1, description=thresholds.MIN_KS_DISTANCE.meaning
     )
     min_observations: int = Field(
-        default=20,
-        ge=2,
-        description="a verdict needs that many standardised observations, or it is undetermined",
+        default=int(thresholds.MIN_OBSERVATIONS.default), ge=2, description=thresholds.MIN_OBSERVATIONS.meaning
     )
     min_track_length: int = Field(
         default=3,
@@ -65,25 +58,23 @@ class AuditConfig(BaseModel):
         description="smaller eigenvalue of I - H below which an observation cannot be verified",
     )
     pose_offset_threshold_px: float = Field(
-        default=0.5,
-        gt=0,
-        description="px; images with a larger pose_offset_px are left out of the statistics of tracks",
+        default=thresholds.MAX_POSE_OFFSET_PX.default, gt=0, description=thresholds.MAX_POSE_OFFSET_PX.meaning
     )
     min_focal_over_size: float = Field(
-        default=0.3, gt=0, description="f / max(width, height) below which a camera is implausible"
+        default=thresholds.MIN_FOCAL_OVER_SIZE.default, gt=0, description=thresholds.MIN_FOCAL_OVER_SIZE.meaning
     )
     max_focal_over_size: float = Field(
-        default=10.0, gt=0, description="f / max(width, height) above which a camera is implausible"
+        default=thresholds.MAX_FOCAL_OVER_SIZE.default, gt=0, description=thresholds.MAX_FOCAL_OVER_SIZE.meaning
     )
     max_sd_focal_rel: float = Field(
-        default=0.01, gt=0, description="sd of f / f above which the focal length is not identified"
+        default=thresholds.MAX_SD_FOCAL_REL.default, gt=0, description=thresholds.MAX_SD_FOCAL_REL.meaning
     )
-    min_k1_sds: float = Field(default=2.0, gt=0, description="|k1| / sd below which k1 is not identified (a remark)")
+    min_k1_sds: float = Field(default=thresholds.MIN_K1_SDS.default, gt=0, description=thresholds.MIN_K1_SDS.meaning)
     min_coverage: float = Field(
-        default=0.2, ge=0, description="share of the image under the inliers' hull below which nothing is said"
+        default=thresholds.MIN_COVERAGE.default, ge=0, description=thresholds.MIN_COVERAGE.meaning
     )
     min_occupied_cells: int = Field(
-        default=16, ge=0, description="occupied cells (of grid x grid) below which nothing is said"
+        default=int(thresholds.MIN_OCCUPIED_CELLS.default), ge=0, description=thresholds.MIN_OCCUPIED_CELLS.meaning
     )
     grid: int = Field(
         default=8,
@@ -99,6 +90,5 @@ class AuditConfig(BaseModel):
 
     def tau_px(self, sigma_px: float) -> float:
         """Return min_effect in px for an image with noise ``sigma_px`` (sigma_constant_px)."""
-        if self.min_effect.endswith("px"):
-            return float(self.min_effect.removesuffix("px"))
-        return float(self.min_effect.removesuffix("sigma")) * sigma_px
+        effect = thresholds.effect_px(self.min_effect, sigma_px)
+        return math.nan if effect is None else effect

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,7 +21,7 @@ import pyarrow.parquet as pq
 TABLES = ("images", "cameras", "models", "observations")
 
 
-def bits(column: pa.ChunkedArray) -> list[object]:
+def bits(column: pa.ChunkedArray[Any]) -> Sequence[object]:
     """Values of a column that compare as their bits do."""
     kind = column.type
     if pa.types.is_float64(kind):

@@ -139,7 +139,7 @@ def evidence(auditor: ModelAuditor) -> dict[str, float]:
 
 
 def _image_evidence(auditor: ModelAuditor, image_idx: int) -> dict[str, float] | None:
-    fact, columns = auditor.facts[image_idx], auditor.residuals.rows(image_idx)
+    fact, columns = auditor.quality[image_idx], auditor.residuals.rows(image_idx)
     if fact is None or columns.stop - columns.start < MIN_INLIERS:
         return None
     camera, y = fact.shape.camera, auditor.residuals.residuals_px[:, columns]
@@ -198,10 +198,12 @@ def _persistence(auditor: ModelAuditor) -> float:
 
 def _common(auditor: ModelAuditor) -> dict[str, float]:
     """Return px of the fields that all images have in common, each image's own pose and intrinsics profiled."""
-    used = [i for i, fact in enumerate(auditor.facts) if fact is not None and not fact.shape.camera.model.is_spherical]
+    used = [
+        i for i, fact in enumerate(auditor.quality) if fact is not None and not fact.shape.camera.model.is_spherical
+    ]
 
     def design(k: int) -> ImageDesign:
-        fact, columns = auditor.facts[used[k]], auditor.residuals.rows(used[k])
+        fact, columns = auditor.quality[used[k]], auditor.residuals.rows(used[k])
         if fact is None:
             raise ValueError("an image without inliers")
         inliers = auditor.inliers(used[k])

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.verdict import REASON_MEANINGS, ReasonCode
 from sfm_audit.audit.table import TABLES
+from sfm_audit.audit.table.words import REASONS, Member, ReasonWords
 from sfm_audit.loaders.model import FINDING_MEANINGS, FindingCode
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -64,7 +64,7 @@ code 3.
 """
 VERDICTS_PAGE = """# Verdicts
 
-Made from `audit/decision/verdict.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
+Made from `audit/table/words.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
 
 Four verdicts judge an image, each by its own question. Each is `accepted`, `rejected`, or `undetermined` where the
 image does not say enough: undetermined is no pass.
@@ -123,35 +123,6 @@ the same list and decide nothing: an accepted image may carry them.
 - Standard deviations of camera parameters are conditional on the points, so they are lower bounds.
 - Accepted is no p-value: of correct images some are rejected too (docs/validation.md says how many).
 """
-_ALL = "all four"
-REASON_EFFECTS = {
-    ReasonCode.KS_REJECTED: ("`verdict_ks`", "rejected"),
-    ReasonCode.TOO_FEW_OBSERVATIONS: (_ALL, "undetermined"),
-    ReasonCode.NON_FINITE_POSE: (_ALL, "undetermined"),
-    ReasonCode.NON_FINITE_CAMERA: (_ALL, "undetermined"),
-    ReasonCode.MISSING_CAMERA: (_ALL, "undetermined"),
-    ReasonCode.EXACT_PROJECTIONS: ("`verdict_ks`, `verdict_misfit`", "undetermined"),
-    ReasonCode.NOISE_NOT_FITTED: ("`verdict_ks`, `plausible`", "undetermined"),
-    ReasonCode.NON_FINITE_DERIVATIVES: ("`verdict_pose`, `plausible`", "undetermined"),
-    ReasonCode.MISFIT_RADIAL: ("`verdict_misfit`", "rejected"),
-    ReasonCode.MISFIT_TANGENTIAL: ("`verdict_misfit`", "rejected"),
-    ReasonCode.MISFIT_AFFINE: ("`verdict_misfit`", "rejected"),
-    ReasonCode.MISFIT_PRINCIPAL_POINT: ("`verdict_misfit`", "rejected"),
-    ReasonCode.MISFIT_ROLLING_SHUTTER: ("`verdict_misfit`", "rejected"),
-    ReasonCode.MISFIT_SMOOTH: ("`verdict_misfit`", "rejected"),
-    ReasonCode.SHARED_CAMERA: ("`verdict_misfit`", "rejected, beside the group"),
-    ReasonCode.MISFIT_NOT_TESTED: ("`verdict_misfit`", "remark; undetermined where no lens group ran"),
-    ReasonCode.POSE_NOT_OPTIMAL: ("`verdict_pose`", "rejected"),
-    ReasonCode.FOCAL_OUT_OF_RANGE: ("`plausible`", "rejected"),
-    ReasonCode.DISTORTION_FOLDS: ("`plausible`", "rejected"),
-    ReasonCode.PRINCIPAL_POINT_OUTSIDE: ("`plausible`", "rejected"),
-    ReasonCode.FOCAL_NOT_IDENTIFIED: ("`plausible`", "undetermined"),
-    ReasonCode.K1_NOT_IDENTIFIED: ("`plausible`", "remark"),
-    ReasonCode.LOW_COVERAGE: ("`plausible`", "undetermined"),
-    ReasonCode.FEW_OCCUPIED_CELLS: ("`plausible`", "undetermined"),
-    ReasonCode.FRONTO_PARALLEL: ("`plausible` of `calibrate`", "remark"),
-    ReasonCode.DEGENERATE_INPUT: ("all four of `calibrate`", "undetermined"),
-}
 
 
 def table_page() -> str:
@@ -182,12 +153,22 @@ def findings_page() -> str:
 def verdicts_page() -> str:
     """Return docs/verdicts.md."""
     rows = [
-        f"| `{code}` | {' | '.join(REASON_EFFECTS[code])} | {_cell(REASON_MEANINGS[code])} |" for code in ReasonCode
+        f"| `{code}` | {_members(words)} | {_makes(words)} | {_cell(words.meaning)} |"
+        for code, words in REASONS.items()
     ]
     reasons = "\n".join(
         ["| code | verdict | makes it | meaning: what stands after the colon |", "|---|---|---|---|", *rows]
     )
     return VERDICTS_PAGE.format(reasons=reasons, **AuditConfig().model_dump())
+
+
+def _members(words: ReasonWords) -> str:
+    return "all" if set(words.members) == set(Member) else ", ".join(f"`{member}`" for member in words.members)
+
+
+def _makes(words: ReasonWords) -> str:
+    made = "remark" if words.makes is None else str(words.makes)
+    return f"{made}, {words.note}" if words.note else made
 
 
 PAGES = {

@@ -13,19 +13,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
-    from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict
+    from sfm_audit.audit.decision.decide import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
     from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor
     from sfm_audit.audit.engine.model import audit_model as audit_reconstruction
     from sfm_audit.audit.table import ModelLabels
+    from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
     from sfm_audit.loaders.colmap.folder import open_model
     from sfm_audit.loaders.errors import LoadError
     from sfm_audit.loaders.model import SparseModel
 
 __all__ = [
     "AuditConfig",
+    "Decision",
     "ImageAudit",
-    "Judgement",
     "LoadError",
     "ModelAudit",
     "ModelAuditor",
@@ -42,15 +43,15 @@ __all__ = [
 _HOMES: Final = {
     "AuditConfig": "audit.config",
     "ImageAudit": "audit.engine.image",
-    "Judgement": "audit.decision.verdict",
+    "Decision": "audit.decision.decide",
     "LoadError": "loaders.errors",
     "ModelAudit": "audit.engine.model",
     "ModelAuditor": "audit.engine.model",
     "ModelLabels": "audit.table",
-    "Reason": "audit.decision.verdict",
-    "ReasonCode": "audit.decision.verdict",
+    "Reason": "audit.table.words",
+    "ReasonCode": "audit.table.words",
     "SparseModel": "loaders.model",
-    "Verdict": "audit.decision.verdict",
+    "Verdict": "audit.table.words",
     "audit_inliers": "audit.engine.image",
     "audit_reconstruction": "audit.engine.model",
     "open_model": "loaders.colmap.folder",

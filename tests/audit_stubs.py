@@ -51,13 +51,13 @@ def break_down(task: Task) -> Outcome:
 
 def lose_an_image_process(task: Task, mark: Path) -> Outcome:
     """Let one of the processes die over which the images are spread."""
-    facts_of = engine._facts_of
+    facts_of = engine._quality_of
     if task.num_processes > 1:
-        engine._facts_of = partial(_die_over_images, mark=mark)
+        engine._quality_of = partial(_die_over_images, mark=mark)
     try:
         return audit_one(task)
     finally:
-        engine._facts_of = facts_of
+        engine._quality_of = facts_of
 
 
 def _die_over_images(_: object, image_idxs: range, mark: Path) -> list[None]:

@@ -13,7 +13,7 @@ from sfm_audit.audit.calibrate.estimate import Estimate
 from sfm_audit.audit.camera_quality.expected_error import GRID, ExpectedErrorMap, cell_centres_px, measurement_error_px
 from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, Identifiability
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, folds_over
-from sfm_audit.audit.decision.verdict import Reason, ReasonCode
+from sfm_audit.audit.table.words import Member, Reason, ReasonCode
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.correspondences.records import Correspondences
 
@@ -57,7 +57,7 @@ def fronto_parallel_reason(geometry: PlaneGeometry, estimate: Estimate) -> Reaso
         return None
     correlation = correlation_focal_depth(estimate)
     detail = f"tilt {geometry.tilt_deg:.2g} deg, correlation of focal length and distance {correlation:.6f}"
-    return Reason(ReasonCode.FRONTO_PARALLEL, detail)
+    return Reason(ReasonCode.FRONTO_PARALLEL, Member.PLAUSIBLE, detail, geometry.tilt_deg, _FRONTO_PARALLEL_DEG, "deg")
 
 
 def identifiability_of(estimate: Estimate) -> Identifiability:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -12,15 +12,18 @@ import pyarrow as pa
 from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimate
 from sfm_audit.audit.calibrate.evidence import correlation_focal_depth
 from sfm_audit.audit.calibrate.validation import Validation, degenerate_judgement
-from sfm_audit.audit.decision.verdict import Verdict
 from sfm_audit.audit.engine.rows import cause_columns, misfit_columns, normality_columns
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import schema
 from sfm_audit.audit.table.arrow import Coded, Values, build_table
+from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.correspondences.records import Correspondences
 
 Row = dict[str, Any]
+
+MEMBERS: Final = (Member.KS, Member.MISFIT, Member.POSE, Member.PLAUSIBLE)
+"""The questions that are asked of an estimate."""
 
 
 def calibration_row(found: Validation, correspondences: Correspondences, location: str, alpha: float) -> Row:
@@ -40,16 +43,13 @@ def calibration_row(found: Validation, correspondences: Correspondences, locatio
         "sigma_l": noise.sigma_l,
         "noise_converged": noise.converged,
         **_test_columns(found, alpha),
-        **misfit_columns(found.misfit.tests),
+        **misfit_columns(found.tests),
         **cause_columns(found.misfit),
         "tau_px": found.tau_px,
         **_evidence_columns(found),
         "verdict": str(found.verdict),
-        "verdict_ks": str(found.judgements.ks.verdict),
-        "verdict_misfit": str(found.judgements.misfit.verdict),
-        "verdict_pose": str(found.judgements.pose.verdict),
-        "plausible": str(found.judgements.plausible.verdict),
-        "reasons": [str(reason) for reason in found.judgement.reasons],
+        **{str(member): found.decision.of(member) for member in MEMBERS},
+        "reasons": [str(reason) for reason in found.decision.reasons],
     }
 
 
@@ -62,7 +62,7 @@ def degenerate_row(model: str, error: DegenerateInputError, correspondences: Cor
         "width": correspondences.width,
         "height": correspondences.height,
         "num_correspondences": correspondences.num,
-        **dict.fromkeys(("verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible"), Verdict.UNDETERMINED),
+        **dict.fromkeys(("verdict", *map(str, MEMBERS)), Verdict.UNDETERMINED),
         "reasons": [str(reason) for reason in degenerate_judgement(error).reasons],
     }
 

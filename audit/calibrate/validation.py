@@ -22,16 +22,24 @@ from sfm_audit.audit.calibrate.lidar import lidar_noise, lidar_predictors
 from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
 from sfm_audit.audit.camera_quality.expected_error import ExpectedErrorMap
 from sfm_audit.audit.camera_quality.identifiability import Identifiability
-from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, judge_plausible, judge_pose
+from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.misfit import Misfit, find_misfit, judge_misfit
-from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict, judge_ks
-from sfm_audit.audit.engine.image import Judgements, exact_projections, limits_of, no_noise
+from sfm_audit.audit.decision.decide import Decision, decide
+from sfm_audit.audit.decision.diagnostics import (
+    CameraDiagnostics,
+    Diagnostics,
+    MisfitDiagnostics,
+    NoiseDiagnostics,
+    misfit_groups,
+)
+from sfm_audit.audit.decision.members import Judgement, undetermined
+from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.misfit.multiplicity import holm
 from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
 from sfm_audit.audit.normality import NormalityTests, normality_tests
+from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.correspondences.records import Correspondences
 
@@ -60,7 +68,8 @@ class Validation:
 
     noise_name: constant or lidar.    xy_px, residuals_px: (n, 2) observed, and observed - projected.
     sd_px: empirical, per axis, sqrt(mean eps^2).    robust, plain: under the robust and under the plain scale.
-    misfit: q is Holm's p.            tau_px: effect that matters.    expected_error: conditional on the points.
+    tests: of misfit.                 tau_px: effect that matters.    expected_error: conditional on the points.
+    decision: as about an image of a reconstruction; q of its misfit is Holm's p.
     """
 
     estimate: Estimate
@@ -71,7 +80,7 @@ class Validation:
     robust: StandardisedResiduals
     plain: StandardisedResiduals
     sigma_constant_px: float
-    misfit: Misfit
+    tests: MisfitTests
     tau_px: float
     pose_offset_px: float
     geometry: PlaneGeometry
@@ -80,13 +89,19 @@ class Validation:
     coverage: float
     occupied_cells: int
     expected_error: ExpectedErrorMap
-    judgements: Judgements
-    judgement: Judgement
+    decision: Decision
 
     @property
     def verdict(self) -> Verdict:
         """The verdict of the policy."""
-        return self.judgement.verdict
+        return self.decision.verdict
+
+    @property
+    def misfit(self) -> MisfitDecision:
+        """The misfit that was found."""
+        if self.decision.misfit is None:
+            raise ValueError("a validation without tests of misfit")
+        return self.decision.misfit
 
     @property
     def error_quartiles_px(self) -> tuple[float, float]:
@@ -138,7 +153,6 @@ def validate(
     projected = estimate.camera.project(xyz_cam)
     tau_px = config.tau_px(constant.sigma_constant_px)
     tests = misfit_tests(estimate, correspondences, robust.noise if noise_name == "lidar" else None)
-    misfit = _misfit(tests, len(xy_px), constant.sigma_constant_px, tau_px, config)
     offset = pose_offset_px(residuals_px, projected.pose[3:].transpose(1, 0, 2), xyz_cam.T)
     camera = estimate.camera
     found = _Evidence(
@@ -149,7 +163,8 @@ def validate(
         coverage(xy_px, camera.width, camera.height),
         occupied_cells(xy_px, camera.width, camera.height, config.grid),
     )
-    judgements = _judge(estimate, residuals_px, robust, misfit, found, config)
+    misfit = _misfit(tests, len(xy_px), constant.sigma_constant_px)
+    decision = decide(_diagnostics(estimate, residuals_px, robust, misfit, found), config)
     return Validation(
         estimate,
         noise_name,
@@ -159,7 +174,7 @@ def validate(
         robust,
         plain,
         constant.sigma_constant_px,
-        misfit,
+        tests,
         tau_px,
         offset,
         found.geometry,
@@ -168,20 +183,19 @@ def validate(
         found.coverage,
         found.occupied_cells,
         expected_error_of(estimate, correspondences, constant.sigma_constant_px),
-        judgements,
-        judgements.under(config.policy),
+        decision,
     )
 
 
 def degenerate_judgement(error: DegenerateInputError) -> Judgement:
     """Judge correspondences that determine no camera: undetermined, with the reason."""
     detail = f"{error.degeneracy.value}, {error.detail}"
-    return Judgement(Verdict.UNDETERMINED, (Reason(ReasonCode.DEGENERATE_INPUT, detail),))
+    return undetermined(Reason(ReasonCode.DEGENERATE_INPUT, Member.PLAUSIBLE, detail))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """What `validate` and `_judge` share."""
+    """What `validate` and `_diagnostics` share."""
 
     pose_offset_px: float
     geometry: PlaneGeometry
@@ -220,55 +234,45 @@ def _standardised(
     return found[0], found[1]
 
 
-def _misfit(tests: MisfitTests, num_observations: int, sigma_px: float, tau_px: float, config: AuditConfig) -> Misfit:
+def _misfit(tests: MisfitTests, num_observations: int, sigma_px: float) -> MisfitDiagnostics:
     adjusted = holm(np.array([tests[group].p for group in GROUPS]))
-    return find_misfit(
-        tests, adjusted, num_observations=num_observations, sigma_px=sigma_px, alpha=config.alpha, tau_px=tau_px
-    )
+    groups = misfit_groups(tests, adjusted, num_observations=num_observations, sigma_px=sigma_px)
+    return MisfitDiagnostics(groups, num_observations, sigma_px)
 
 
-def _judge(
+def _diagnostics(
     estimate: Estimate,
     residuals_px: FloatArray,
     standardised: StandardisedResiduals,
-    misfit: Misfit,
+    misfit: MisfitDiagnostics,
     found: _Evidence,
-    config: AuditConfig,
-) -> Judgements:
-    """Return all four verdicts of method.md section 7."""
-    num, limits = residuals_px.shape[1], limits_of(config)
-    blocked = _few(num, "inliers", config) or exact_projections(
-        residuals_px, max(estimate.camera.width, estimate.camera.height)
-    )
-    tests = standardised.tests
-    num_known = tests.num_values // 2
-    ks = judge_ks(tests.ks_stat, tests.ks_p, tests.num_values, alpha=config.alpha, min_distance=config.min_ks_distance)
-    no_ks = blocked or (no_noise(standardised.noise) if math.isnan(tests.ks_p) else None)
-    no_ks = no_ks or _few(num_known, f"standardised of {num} inliers", config)
-    plausible = judge_plausible(
-        found.plausibility,
-        found.identifiability,
-        coverage=found.coverage,
-        occupied_cells=found.occupied_cells,
-        num_inliers=num,
-        limits=limits,
-    )
+) -> Diagnostics:
+    """What is decided upon, as of an image of a reconstruction."""
+    known, camera, tests = found.identifiability, estimate.camera, standardised.tests
     warning = fronto_parallel_reason(found.geometry, estimate)
-    if warning is not None:
-        plausible = Judgement(plausible.verdict, (*plausible.reasons, warning))
-    return Judgements(
-        _undetermined(no_ks) if no_ks else ks,
-        _undetermined(blocked) if blocked else judge_misfit(misfit),
-        judge_pose(found.pose_offset_px, num, limits),
-        plausible,
+    return Diagnostics(
+        num_inliers=residuals_px.shape[1],
+        noise=NoiseDiagnostics(
+            tests.num_values // 2, tests.num_values, tests.ks_stat, tests.ks_p, is_fitted=not math.isnan(tests.ks_p)
+        ),
+        pose_offset_px=found.pose_offset_px,
+        misfit=misfit,
+        camera=CameraDiagnostics(
+            focal_over_size=found.plausibility.focal_over_size,
+            folds_over=found.plausibility.folds_over,
+            principal_point_px=found.plausibility.principal_point_px,
+            principal_point_outside=found.plausibility.principal_point_outside,
+            size_px=found.plausibility.size_px,
+            coverage=found.coverage,
+            occupied_cells=found.occupied_cells,
+            has_focal=known.has_focal,
+            sd_focal_rel=known.sd_focal_rel,
+            singular_share=known.parameters.singular_share,
+            is_singular=known.parameters.is_singular,
+            k1=known.k1 if known.has_k1 else None,
+            sd_k1=known.sd_k1,
+        ),
+        largest_residual_px=float(np.abs(residuals_px).max(initial=0.0)),
+        longer_side_px=max(camera.width, camera.height),
+        remarks=() if warning is None else (warning,),
     )
-
-
-def _few(num: int, what: str, config: AuditConfig) -> Reason | None:
-    if num >= config.min_observations:
-        return None
-    return Reason(ReasonCode.TOO_FEW_OBSERVATIONS, f"{num} {what}, {config.min_observations} needed")
-
-
-def _undetermined(reason: Reason) -> Judgement:
-    return Judgement(Verdict.UNDETERMINED, (reason,))

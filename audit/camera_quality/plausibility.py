@@ -1,6 +1,6 @@
 """Could this be a camera at all? Low residuals do not say so (method.md sections 6 and 7).
 
-Measures of one camera, and the verdicts on pose and plausibility that use them.
+Measures of one camera alone; `audit.decision` judges them.
 """
 
 from __future__ import annotations
@@ -11,12 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.identifiability import Identifiability
 from sfm_audit.audit.cameras.columns import Want
 from sfm_audit.audit.cameras.projection import extra_params, is_fisheye, scale_and_shift
 from sfm_audit.audit.cameras.rational import RATIONAL_PLANES
 from sfm_audit.audit.cameras.warps import WARPS
-from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
@@ -135,138 +133,3 @@ def _states(
         upright = np.broadcast_to((xu * yv - xv * yu > 0.0) & (np.add(xu, yv) > 0.0), u.shape)
         arrived = (x * x + y * y).reshape(radius.shape) >= (reach * reach)[:, None]
     return np.stack([~upright.reshape(radius.shape), arrived])
-
-
-@dataclass(frozen=True, slots=True)
-class PlausibilityLimits:
-    """Thresholds of method.md sections 6 and 7.
-
-    min_focal_over_size, max_focal_over_size: f / max(width, height) of a plausible camera.
-    max_sd_focal_rel: sd_f / f above which the focal length is not identified.    min_k1_sds: |k1| / sd below which k1
-    is not identified.    min_coverage, min_occupied_cells: of the image, and of 8 x 8 cells.
-    min_observations: inliers below which nothing is said.    max_pose_offset_px: see `judge_pose`.
-    """
-
-    min_focal_over_size: float = 0.3
-    max_focal_over_size: float = 10.0
-    max_sd_focal_rel: float = 0.01
-    min_k1_sds: float = 2.0
-    min_coverage: float = 0.2
-    min_occupied_cells: int = 16
-    min_observations: int = 20
-    max_pose_offset_px: float = 0.5
-
-
-DEFAULT_LIMITS: Final = PlausibilityLimits()
-
-
-def judge_pose(pose_offset_px: float, num_inliers: int, limits: PlausibilityLimits = DEFAULT_LIMITS) -> Judgement:
-    """Judge whether the pose is at the optimum of the image's own residuals.
-
-    Parameters
-    ----------
-    pose_offset_px : see `audit.inliers.stationarity.pose_offset_px`; NaN where derivatives are not finite
-    num_inliers : observations behind it
-
-    Notes
-    -----
-    method.md section 7's verdict_pose: rejected when pose_offset_px > 0.5; undetermined with fewer than 20 inliers.
-    Blind to a wrong pose that was adjusted together with its residuals: it is at its optimum.
-    """
-    if num_inliers < limits.min_observations:
-        return Judgement(Verdict.UNDETERMINED, (_too_few(num_inliers, limits),))
-    if math.isnan(pose_offset_px):
-        detail = f"pose offset unknown, {num_inliers} inliers"
-        return Judgement(Verdict.UNDETERMINED, (Reason(ReasonCode.NON_FINITE_DERIVATIVES, detail),))
-    if pose_offset_px > limits.max_pose_offset_px:
-        detail = f"pose_offset_px = {pose_offset_px:.3g} > {limits.max_pose_offset_px:g}"
-        return Judgement(Verdict.REJECTED, (Reason(ReasonCode.POSE_NOT_OPTIMAL, detail),))
-    return Judgement(Verdict.ACCEPTED)
-
-
-def judge_plausible(
-    camera: CameraPlausibility,
-    identifiability: Identifiability,
-    *,
-    coverage: float,
-    occupied_cells: int,
-    num_inliers: int,
-    limits: PlausibilityLimits = DEFAULT_LIMITS,
-) -> Judgement:
-    """Judge whether this could be a camera, and whether the image says enough about it.
-
-    Parameters
-    ----------
-    camera : measures of the camera           identifiability : of the image, conditional on the points
-    coverage, occupied_cells : see `coverage`, 8 x 8 cells        num_inliers : observations behind all of it
-
-    Notes
-    -----
-    method.md section 7's plausible. All reasons are listed, also the undetermined ones of a rejected image. That k1 is
-    not identified is a reason only: an accepted image may carry it (the advice is a camera model without it).
-    """
-    rejections = _implausible(camera, limits)
-    doubts = _too_little(identifiability, coverage, occupied_cells, num_inliers, limits)
-    remarks = _remarks(identifiability, num_inliers, limits)
-    verdict = Verdict.REJECTED if rejections else Verdict.UNDETERMINED if doubts else Verdict.ACCEPTED
-    return Judgement(verdict, (*rejections, *doubts, *remarks))
-
-
-def _too_few(num_inliers: int, limits: PlausibilityLimits) -> Reason:
-    detail = f"{num_inliers} inliers, {limits.min_observations} needed"
-    return Reason(ReasonCode.TOO_FEW_OBSERVATIONS, detail)
-
-
-def _implausible(camera: CameraPlausibility, limits: PlausibilityLimits) -> list[Reason]:
-    """Reasons to reject the camera as such."""
-    reasons = []
-    low, high = limits.min_focal_over_size, limits.max_focal_over_size
-    if camera.principal_point_px is not None and not low <= camera.focal_over_size <= high:
-        detail = f"f / max(w, h) = {camera.focal_over_size:.3g}, outside [{low:g}, {high:g}]"
-        reasons.append(Reason(ReasonCode.FOCAL_OUT_OF_RANGE, detail))
-    if camera.folds_over:
-        detail = f"inside the image of {camera.size_px[0]} x {camera.size_px[1]} px"
-        reasons.append(Reason(ReasonCode.DISTORTION_FOLDS, detail))
-    if camera.principal_point_px is not None and camera.principal_point_outside:
-        x, y = camera.principal_point_px
-        detail = f"({x:.1f}, {y:.1f}) px, image of {camera.size_px[0]} x {camera.size_px[1]} px"
-        reasons.append(Reason(ReasonCode.PRINCIPAL_POINT_OUTSIDE, detail))
-    return reasons
-
-
-def _too_little(
-    found: Identifiability, coverage: float, occupied_cells: int, num_inliers: int, limits: PlausibilityLimits
-) -> list[Reason]:
-    """Reasons not to decide."""
-    if num_inliers < limits.min_observations:
-        return [_too_few(num_inliers, limits)]
-    reasons = []
-    if found.has_focal and not found.sd_focal_rel <= limits.max_sd_focal_rel:
-        reasons.append(_focal_doubt(found, num_inliers, limits))
-    if not coverage >= limits.min_coverage:
-        reasons.append(Reason(ReasonCode.LOW_COVERAGE, f"{coverage:.1%} < {limits.min_coverage:.0%} of the image"))
-    if occupied_cells < limits.min_occupied_cells:
-        detail = f"{occupied_cells} < {limits.min_occupied_cells}"
-        reasons.append(Reason(ReasonCode.FEW_OCCUPIED_CELLS, detail))
-    return reasons
-
-
-def _focal_doubt(found: Identifiability, num_inliers: int, limits: PlausibilityLimits) -> Reason:
-    """Why nothing is known of the focal length: derivatives, noise, a singular N, or a large deviation."""
-    share = found.parameters.singular_share
-    if math.isnan(share):
-        return Reason(ReasonCode.NON_FINITE_DERIVATIVES, f"covariance unknown, {num_inliers} inliers")
-    if found.parameters.is_singular:
-        return Reason(ReasonCode.FOCAL_NOT_IDENTIFIED, f"smallest / largest singular value = {share:.2g}")
-    if math.isnan(found.sd_focal_rel):
-        return Reason(ReasonCode.NOISE_NOT_FITTED, f"{num_inliers} observations")
-    detail = f"sd_f / f = {found.sd_focal_rel:.2%} > {limits.max_sd_focal_rel:.0%}, conditional on the points"
-    return Reason(ReasonCode.FOCAL_NOT_IDENTIFIED, detail)
-
-
-def _remarks(found: Identifiability, num_inliers: int, limits: PlausibilityLimits) -> list[Reason]:
-    """Reasons that decide nothing."""
-    if num_inliers < limits.min_observations or found.k1_identified(limits.min_k1_sds) is not False:
-        return []
-    detail = f"{found.k1:.3g}, sd = {found.sd_k1:.2g}, conditional on the points"
-    return [Reason(ReasonCode.K1_NOT_IDENTIFIED, detail)]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import click
 
 from sfm_audit.audit.cli.auditing import print_page, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
-from sfm_audit.audit.config import AuditConfig, PolicyName
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.table.words import POLICIES
 from sfm_audit.loaders.errors import LoadError
 from sfm_audit.reports.errors import OutputError
 from sfm_audit.reports.run_folder.new_files import new_folder
@@ -64,7 +65,7 @@ def _min_effect(_ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option("--points", type=click.Choice(["independent"]), default="independent", help="The only choice here.")
 @click.option("--alpha", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.05, show_default=True)
 @click.option("--min-effect", metavar="TAU", callback=_min_effect, default="0.5sigma", show_default=True)
-@click.option("--policy", type=click.Choice(get_args(PolicyName)), default="full", show_default=True)
+@click.option("--policy", type=click.Choice(tuple(POLICIES)), default="full", show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of RANSAC's samples.")
 @click.option("-o", "--out", metavar="FOLDER", type=click.Path(path_type=Path), help="Tables and figures.")
 @click.option("--force", is_flag=True, help="Replace an earlier calibration in FOLDER.")

@@ -15,20 +15,19 @@ import numpy as np
 from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
 from sfm_audit.audit.simulate.adjust import write_adjusted_model
 from sfm_audit.audit.simulate.defects import DefectKind
 from sfm_audit.audit.simulate.demo import TruthRecord, demo_scene, truth_records
 from sfm_audit.audit.simulate.scene import simulate_scene
+from sfm_audit.audit.table.words import Member, ReasonCode, Verdict, is_remark, verdict_under
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, draw
-from sfm_audit.reports.text.reasons import is_remark
 from sfm_audit.reports.text.wording import MISSING, counted, paragraph
 
 TRUTH_FILE: Final = "truth.json"
 MARK: Final = "sfm-audit demo"
 IMAGE_COLUMNS: Final = (
-    *("image_name", "num_inliers", "verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible", "reasons"),
+    *("image_name", "num_inliers", "verdict", *map(str, Member), "reasons"),
     *("misfit_group", "misfit_px", "advised_camera_model"),
 )
 NOT_REGISTERED: Final = {**dict.fromkeys(IMAGE_COLUMNS), "verdict": "not registered"}
@@ -138,12 +137,13 @@ def _why_not_found(row: Row, min_effect: str) -> str:
 
 def _false_alarms(sound: Sequence[Row]) -> list[str]:
     """Count the sound images that are rejected, by policy."""
-    by_ks = {row["image_name"] for row in sound if row["verdict_ks"] == Verdict.REJECTED}
-    members = ("verdict_misfit", "verdict_pose", "plausible")
-    by_camera = {row["image_name"] for row in sound if any(row[name] == Verdict.REJECTED for name in members)}
-    counts = f"{len(by_ks | by_camera)} under policy full, {len(by_camera)} camera, {len(by_ks)} paper"
+    rejected = {
+        policy: sum(verdict_under(policy, row) == Verdict.REJECTED for row in sound)
+        for policy in ("full", "camera", "paper")
+    }
+    counts = f"{rejected['full']} under policy full, {rejected['camera']} camera, {rejected['paper']} paper"
     lines = [f"Of {counted(len(sound), 'sound image')} rejected (false alarms): {counts}."]
-    if by_ks:
+    if rejected["paper"]:
         lines.append(
             "KS judges the noise: here it differs from track to track, and where the noise model did not quite predict "
             "it, KS rejects an image whose camera is right. Policy camera leaves KS out."

@@ -11,7 +11,8 @@ from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.settings import read_config
-from sfm_audit.audit.config import NoiseName, PointsName, PolicyName
+from sfm_audit.audit.config import NoiseName, PointsName
+from sfm_audit.audit.table.words import POLICIES
 from sfm_audit.loaders import LoadError, SparseModel, discover, open_model
 from sfm_audit.reports.errors import OutputError
 from sfm_audit.reports.run_folder.new_files import new_folder
@@ -28,7 +29,7 @@ _SETTINGS: Final = ("noise", "points", "min_effect", "policy")
 @click.option("--noise", type=click.Choice(get_args(NoiseName)), help="Noise model, as in run.")
 @click.option("--points", type=click.Choice(get_args(PointsName)), help="As in run.")
 @click.option("--min-effect", metavar="TAU", help="Misfit that matters, as in run.")
-@click.option("--policy", type=click.Choice(get_args(PolicyName)), help="Which verdicts decide, as in run.")
+@click.option("--policy", type=click.Choice(tuple(POLICIES)), help="Which verdicts decide, as in run.")
 @click.option(
     "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Settings, as in run."
 )

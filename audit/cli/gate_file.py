@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
-from sfm_audit.audit.decision.verdict import ReasonCode
+from sfm_audit.audit.table.words import ReasonCode
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits, PartPolicy
 
 _KEYS_OF: Final[dict[str, type[BaseModel]]] = {

@@ -69,11 +69,11 @@ def _expected_error(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any
     camera, sigma_px = auditor.model.image(image_idx).camera, row["sigma_constant_px"]
     if camera is None or row["expected_error_px"] is None:
         return None
-    facts, xyz_cam = auditor.facts[image_idx], _xyz_cam(auditor, image_idx)
-    if facts is None:
+    quality, xyz_cam = auditor.quality[image_idx], _xyz_cam(auditor, image_idx)
+    if quality is None:
         return None
     depth = median_depth(camera, xyz_cam)
-    return expected_error_map(camera, facts.identifiability.parameters, sigma_px, depth).error_px
+    return expected_error_map(camera, quality.identifiability.parameters, sigma_px, depth).error_px
 
 
 def _xyz_cam(auditor: ModelAuditor, image_idx: int) -> FloatArray:

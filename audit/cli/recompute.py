@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.table.thresholds import effect_px
 from sfm_audit.loaders import LoadError, MissingFileError, SparseModel, open_model
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
@@ -120,6 +121,4 @@ def _location(run: RunReader, model_path: str) -> str:
 def tau_px(config: Mapping[str, Any], sigma_px: float | None) -> float | None:
     """Return the effect that matters, px, under the settings in a run.json; None where it is not known."""
     effect = config.get("min_effect")
-    if effect is None or (sigma_px is None and effect.endswith("sigma")):
-        return None
-    return AuditConfig(min_effect=effect).tau_px(sigma_px or 0.0)
+    return None if effect is None else effect_px(effect, sigma_px)

@@ -11,7 +11,8 @@ from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, 
 from sfm_audit.audit.cli.errors import ExitCode
 from sfm_audit.audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
-from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName, PolicyName
+from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
+from sfm_audit.audit.table.words import POLICIES
 
 _DEFAULTS = AuditConfig()
 
@@ -46,7 +47,7 @@ _DEFAULTS = AuditConfig()
 )
 @click.option(
     "--policy",
-    type=click.Choice(get_args(PolicyName)),
+    type=click.Choice(tuple(POLICIES)),
     help=f"Which verdicts decide.  [default: {_DEFAULTS.policy}]",
 )
 @click.option(

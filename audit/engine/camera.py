@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.diagnostics import CameraFacts
-from sfm_audit.audit.decision.misfit import Misfit, find_misfit
+from sfm_audit.audit.camera_quality.measure import CameraQuality
+from sfm_audit.audit.decision.diagnostics import misfit_groups
+from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit import (
     ImageDesign,
@@ -37,7 +38,8 @@ class CameraAudit:
     image_idxs: IntArray
     num_points: int
     num_observations: int
-    misfit: Misfit
+    tests: MisfitTests
+    misfit: MisfitDecision
     advised_camera_model: str | None
 
 
@@ -77,7 +79,7 @@ class _CameraImages:
 def audit_cameras(
     model: SparseModel,
     residuals: ModelResiduals,
-    facts: Sequence[CameraFacts | None],
+    quality: Sequence[CameraQuality | None],
     sigma_px: FloatArray,
     *,
     alpha: float,
@@ -87,7 +89,7 @@ def audit_cameras(
 
     Parameters
     ----------
-    facts : per image, None without inliers            sigma_px, tau_px : (I,) sigma_constant_px and materiality
+    quality : per image, None without inliers            sigma_px, tau_px : (I,) sigma_constant_px and materiality
 
     Notes
     -----
@@ -95,7 +97,7 @@ def audit_cameras(
     has that image's tests: Hotelling's law holds for few observations too, and clustering by track changes nothing
     there but for points that the image sees twice. q: Benjamini-Hochberg over the model's cameras.
     """
-    audited = np.array([i for i, fact in enumerate(facts) if fact is not None], dtype=np.int64)
+    audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
     cameras = np.unique(model.images.camera_idx[audited])
     groups = [
         _CameraImages(model, residuals, model.camera(int(c)), audited[model.images.camera_idx[audited] == c])
@@ -104,7 +106,7 @@ def audit_cameras(
     tracks = [group.tracks() for group in groups]
     tests = [
         own.misfit
-        if len(group.image_idxs) == 1 and (own := facts[int(group.image_idxs[0])]) is not None
+        if len(group.image_idxs) == 1 and (own := quality[int(group.image_idxs[0])]) is not None
         else group.tests(group.camera, *track).tests
         for group, track in zip(groups, tracks, strict=True)
     ]
@@ -113,24 +115,18 @@ def audit_cameras(
     for k, (group, (rows, num_points)) in enumerate(zip(groups, tracks, strict=True)):
         num_observations = sum(part.size for part in rows)
         sigma, tau = float(np.median(sigma_px[group.image_idxs])), float(np.median(tau_px[group.image_idxs]))
-        misfit = find_misfit(
-            tests[k],
-            significance.q[k],
-            num_observations=num_observations,
-            sigma_px=sigma,
-            alpha=alpha,
-            tau_px=tau,
-        )
+        groups_of = misfit_groups(tests[k], significance.q[k], num_observations=num_observations, sigma_px=sigma)
+        misfit = decide_misfit(groups_of, alpha=alpha, tau_px=tau)
         advice = advised_camera_model(
             group.camera,
             misfit.group if misfit.material else None,
             misfit.material,
             retest=_retest(group, rows, num_points),
-            distortion_identified=_distortion_identified([facts[int(i)] for i in group.image_idxs]),
+            distortion_identified=_distortion_identified([quality[int(i)] for i in group.image_idxs]),
             alpha=alpha,
             tau_px=tau,
         )
-        out.append(CameraAudit(group.camera, group.image_idxs, num_points, num_observations, misfit, advice))
+        out.append(CameraAudit(group.camera, group.image_idxs, num_points, num_observations, tests[k], misfit, advice))
     return out
 
 
@@ -145,17 +141,17 @@ def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> 
     return retest
 
 
-def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float = 2.0) -> bool:
+def _distortion_identified(quality: Sequence[CameraQuality | None], min_sds: float = 2.0) -> bool:
     """Whether some distortion parameter differs from 0 by two standard deviations, the images' information summed.
 
     Each image's information is taken after its own pose and focal length were profiled, so the sum is a little low.
     """
-    known = [fact for fact in facts if fact is not None]
+    known = [each for each in quality if each is not None]
     if not known or not known[0].shape.camera.model.extra_idxs:
         return True
     camera = known[0].shape.camera
     for idx in camera.model.extra_idxs:
-        sds = np.array([fact.identifiability.parameters.sd_of(camera.model.param_names[idx]) for fact in known])
+        sds = np.array([each.identifiability.parameters.sd_of(camera.model.param_names[idx]) for each in known])
         sds = sds[np.isfinite(sds) & (sds > 0)]
         information = float((sds**-2.0).sum())
         if information > 0 and abs(camera.params[idx]) >= min_sds / math.sqrt(information):
@@ -163,14 +159,14 @@ def _distortion_identified(facts: Sequence[CameraFacts | None], min_sds: float =
     return False
 
 
-def image_advice(fact: CameraFacts, misfit: Misfit, retest: Retest, *, alpha: float, tau_px: float) -> str | None:
+def image_advice(quality: CameraQuality, misfit: MisfitDecision, retest: Retest, *, alpha: float) -> str | None:
     """Return the camera model that one image asks for; ``retest`` of its points and residuals."""
     return advised_camera_model(
-        fact.shape.camera,
+        quality.shape.camera,
         misfit.group if misfit.material else None,
         misfit.material,
         retest=retest,
-        distortion_identified=_distortion_identified([fact]),
+        distortion_identified=_distortion_identified([quality]),
         alpha=alpha,
-        tau_px=tau_px,
+        tau_px=misfit.tau_px,
     )

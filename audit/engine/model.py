@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Protocol, TypeVar
 
@@ -11,13 +11,13 @@ import numpy as np
 import pyarrow as pa
 from threadpoolctl import threadpool_limits
 
-from sfm_audit.audit.camera_quality.diagnostics import CameraFacts, CameraShape, camera_facts
+from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, camera_quality
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.misfit import shared_camera_reason
-from sfm_audit.audit.decision.verdict import Judgement, Reason, ReasonCode
+from sfm_audit.audit.decision.decide import Decision
+from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit, misfit_groups
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras
 from sfm_audit.audit.engine.findings import residual_findings
-from sfm_audit.audit.engine.image import CameraOpinion, ImageAudit, Judgements, judged, opinion_of
+from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image
 from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
@@ -29,6 +29,7 @@ from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels, TableName, build_table, empty_table, schema
+from sfm_audit.audit.table.words import Member, ReasonCode
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
 
@@ -95,7 +96,7 @@ class ModelAuditor:
             raise ValueError("the noise model keypoint needs keypoint_scale_px")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out where images are audited: who receives an auditor audits them himself."""
+        """Leave out where images are audited: an unpickled auditor runs serially."""
         return {**self.__dict__, "_spread": in_turn}
 
     @cached_property
@@ -143,15 +144,15 @@ class ModelAuditor:
         return np.array([self.config.tau_px(float(sigma)) for sigma in self.sigma_constant_px], dtype=np.float64)
 
     @cached_property
-    def facts(self) -> tuple[CameraFacts | None, ...]:
-        """Each image's evidence on its camera as the model stands; None without inliers."""
+    def quality(self) -> tuple[CameraQuality | None, ...]:
+        """What each image says of its camera as the model stands; None without inliers."""
         _ = self.sigma_constant_px  # with the residuals, what the images share
-        return tuple(self._spread(_facts_of, self))
+        return tuple(self._spread(_quality_of, self))
 
     @cached_property
     def blame(self) -> Blame:
         """Misfit of all images, as the model stands and after the images at fault were peeled off."""
-        tests = [fact.misfit if fact else UNTESTED for fact in self.facts]
+        tests = [each.misfit if each else UNTESTED for each in self.quality]
         if self.config.points == "independent":
             return Blame.of_nobody(tests, self.residuals, most_are_wrong=False)
         excluded = self.residuals.pose_offset_px > self.config.pose_offset_threshold_px
@@ -166,7 +167,7 @@ class ModelAuditor:
         return audit_cameras(
             self.model,
             self.residuals,
-            self.facts,
+            self.quality,
             self.sigma_constant_px,
             alpha=self.config.alpha,
             tau_px=self.tau_px,
@@ -176,22 +177,20 @@ class ModelAuditor:
         point_idx = self.residuals.point_idx[self.residuals.rows(image_idx)]
         return self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(point_idx, axis=0))
 
-    def opinion(self, image_idx: int) -> CameraOpinion | None:
-        """What was decided about the camera of the image in row ``image_idx``; None without inliers."""
-        fact = self.facts[image_idx]
-        if fact is None:
+    def misfit(self, image_idx: int) -> MisfitDiagnostics | None:
+        """The final tests of the image in row ``image_idx``; None without inliers."""
+        if self.quality[image_idx] is None:
             return None
-        clean = self.blame.clean[self.residuals.rows(image_idx)]
-        opinion = opinion_of(
-            fact,
+        num_tested = int(np.count_nonzero(self.blame.clean[self.residuals.rows(image_idx)]))
+        sigma_px = float(self.sigma_constant_px[image_idx])
+        groups = misfit_groups(
             self.blame.final_tests[image_idx],
             self.blame.final.q[image_idx],
-            int(np.count_nonzero(clean)),
-            partial(self._retest, image_idx),
-            float(self.sigma_constant_px[image_idx]),
-            self.config,
+            num_observations=num_tested,
+            sigma_px=sigma_px,
         )
-        return replace(opinion, shared=self._shared_fault(image_idx)) if self.blame.most_are_wrong else opinion
+        shared = self._shared_misfit(image_idx) if self.blame.most_are_wrong else None
+        return MisfitDiagnostics(groups, num_tested, sigma_px, shared)
 
     def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
         """The final tests of the image if it had been fitted with this camera, to first order."""
@@ -200,13 +199,14 @@ class ModelAuditor:
         residuals_px = self.blame.residuals_px[:, rows].take(used, axis=1)
         return image_retest(self._xyz_cam(image_idx)[used], residuals_px)(camera)
 
-    def _shared_fault(self, image_idx: int) -> Reason | None:
-        """The reason that the image's camera as a whole is at fault, if several images share it and together say so."""
+    def _shared_misfit(self, image_idx: int) -> SharedMisfit | None:
+        """What the image's camera shows as a whole, if several images share it and together find a material misfit."""
         camera_id = int(self.model.images.camera_id[image_idx])
         camera = next((c for c in self.cameras if c.camera.camera_id == camera_id), None)
-        if camera is None or len(camera.image_idxs) < 2 or not camera.misfit.material:
+        if camera is None or len(camera.image_idxs) < 2 or not camera.misfit.material or camera.misfit.group is None:
             return None
-        return shared_camera_reason(camera_id, len(camera.image_idxs), camera.misfit)
+        found = camera.misfit
+        return SharedMisfit(camera_id, len(camera.image_idxs), camera.misfit.group, found.px, found.q)
 
     @cached_property
     def stored_errors(self) -> StoredErrors:
@@ -235,17 +235,18 @@ class ModelAuditor:
         rows = self.residuals.rows(image_idx)
         residuals_px = self.residuals.residuals_px[:, rows]
         constant = constant_noise(residuals_px)
-        return judged(
+        evidence = ImageEvidence(
             self.inliers(image_idx),
             residuals_px,
             float(self.residuals.pose_offset_px[image_idx]),
             constant,
             self._noise(image_idx, constant),
-            self.tracks.statistics.track_length[rows],
-            self.facts[image_idx],
-            self.opinion(image_idx),
-            self.config,
+            track_length=self.tracks.statistics.track_length[rows],
+            quality=self.quality[image_idx],
+            misfit=self.misfit(image_idx),
+            retest=partial(self._retest, image_idx),
         )
+        return audit_image(evidence, self.config)
 
     def _noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
         """The image's noise under the chosen model."""
@@ -287,14 +288,14 @@ class ModelAuditor:
         _ = self.blame, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks  # shared
         images = self._spread(partial(_images_of, labels=labels), self)
         rows = [row for row, _ in images]
-        judgements = [judgement for _, judgement in images]
+        decisions = [decision for _, decision in images]
         num_exact = sum(
-            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in members.ks.reasons)
-            for _, members in judgements
+            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in decision.members[Member.KS].reasons)
+            for decision in decisions
         )
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
         findings = [*self.model.findings, *own_findings]
-        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, judgements)
+        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(
             _images_table(rows),
             _table("cameras", [camera_row(camera, labels) for camera in self.cameras]),
@@ -334,11 +335,11 @@ def audit_model(
         return auditor.tables(labels, observations=observations)
 
 
-def _facts_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraFacts | None]:
-    """Evidence on the cameras of some images; what depends on a camera alone is computed once for them."""
+def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality | None]:
+    """What some images say of their cameras; what depends on a camera alone is computed once for them."""
     model, residuals = auditor.model, auditor.residuals
     shapes: dict[int, CameraShape | None] = {}
-    out: list[CameraFacts | None] = []
+    out: list[CameraQuality | None] = []
     for image_idx in image_idxs:
         camera_idx = int(model.images.camera_idx[image_idx])
         rows = residuals.rows(image_idx)
@@ -355,16 +356,14 @@ def _facts_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraFacts | No
         xyz_cam = model.image(image_idx).cam_from_world(model.points.xyz_world.take(residuals.point_idx[rows], axis=0))
         sigma_px = float(auditor.sigma_constant_px[image_idx])
         own = residuals.residuals_px[:, rows]
-        out.append(camera_facts(shape, xy_px, xyz_cam, own, sigma_px, auditor.config.grid))
+        out.append(camera_quality(shape, xy_px, xyz_cam, own, sigma_px, grid=auditor.config.grid))
     return out
 
 
-def _images_of(
-    auditor: ModelAuditor, image_idxs: range, labels: ModelLabels
-) -> list[tuple[Row, tuple[Judgement, Judgements]]]:
-    """Rows of the image table and judgements of some images."""
+def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:
+    """Rows of the image table and decisions about some images."""
     audits = map(auditor.image, image_idxs)
-    return [(image_row(audit, labels, auditor.config.noise), (audit.judgement, audit.judgements)) for audit in audits]
+    return [(image_row(audit, labels, auditor.config.noise), audit.decision) for audit in audits]
 
 
 def _images_table(rows: Sequence[Row]) -> pa.Table:

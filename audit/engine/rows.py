@@ -9,16 +9,17 @@ from dataclasses import asdict
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.diagnostics import CameraFacts
-from sfm_audit.audit.decision.misfit import Misfit
-from sfm_audit.audit.decision.verdict import Judgement, Verdict
+from sfm_audit.audit.camera_quality.measure import CameraQuality
+from sfm_audit.audit.decision.decide import Decision
+from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import CameraAudit
-from sfm_audit.audit.engine.image import ImageAudit, Judgements
+from sfm_audit.audit.engine.image import ImageAudit
 from sfm_audit.audit.inliers.stored_errors import StoredErrors
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
+from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.model import Finding, SparseModel
 
 Row = dict[str, object]
@@ -28,7 +29,7 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
     """Return the row of one image; ``ks_q`` needs all rows of the model and is left NaN."""
     inliers, image, camera = audit.inliers, audit.image, audit.image.camera
     num_inliers = len(inliers.xy_px)
-    facts = audit.facts
+    quality = audit.quality
     lost = inliers.num_behind + inliers.num_nonfinite + inliers.num_dangling
     return {
         **asdict(labels),
@@ -48,23 +49,22 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         "num_unverifiable": num_inliers - len(audit.noise.z),
         "num_standardised": len(audit.noise.z),
         "mean_track_length": math.nan if audit.track_length is None or not num_inliers else audit.track_length.mean(),
-        "coverage": facts.coverage if facts else (0.0 if camera else math.nan),
-        "occupied_cells": facts.occupied_cells if facts else (0 if camera else None),
+        "coverage": quality.coverage if quality else (0.0 if camera else math.nan),
+        "occupied_cells": quality.occupied_cells if quality else (0 if camera else None),
         **_error_summary(audit),
         "noise_model": noise_name,
         **_noise_columns(audit),
         **_test_columns(audit),
-        **misfit_columns(facts.misfit if facts else None),
-        **cause_columns(audit.opinion.misfit if audit.opinion else None),
-        "advised_camera_model": audit.opinion.advised_camera_model if audit.opinion else None,
+        **misfit_columns(quality.misfit if quality else None),
+        **cause_columns(audit.misfit),
+        "advised_camera_model": audit.advised_camera_model,
         "pose_offset_px": audit.pose_offset_px,
-        **_camera_columns(facts),
+        **_camera_columns(quality),
         "verdict": str(audit.verdict),
-        "verdict_ks": str(audit.judgements.ks.verdict),
-        "verdict_misfit": str(audit.judgements.misfit.verdict),
-        "verdict_pose": str(audit.judgements.pose.verdict),
-        "plausible": str(audit.judgements.plausible.verdict),
-        "reasons": [str(reason) for reason in audit.judgement.reasons],
+        **{str(member): audit.decision.of(member) for member in Member},
+        "severity": None,
+        "reasons": [str(reason) for reason in audit.reasons],
+        "reason_details": audit.decision.all_reasons,
     }
 
 
@@ -149,25 +149,25 @@ def misfit_columns(tests: MisfitTests | None) -> Row:
     return row
 
 
-def cause_columns(misfit: Misfit | None) -> Row:
+def cause_columns(misfit: MisfitDecision | None) -> Row:
     """Return the named cause, its effect and q."""
     return {
         "misfit_group": str(misfit.group) if misfit and misfit.group else None,
         "misfit_px": misfit.px if misfit else math.nan,
-        "misfit_q": misfit.of_q if misfit else math.nan,
+        "misfit_q": misfit.q if misfit else math.nan,
     }
 
 
-def _camera_columns(facts: CameraFacts | None) -> Row:
-    known = facts.identifiability if facts else None
-    plausible = facts.shape.plausibility if facts else None
+def _camera_columns(quality: CameraQuality | None) -> Row:
+    known = quality.identifiability if quality else None
+    plausible = quality.shape.plausibility if quality else None
     return {
         "sd_focal_px": known.sd_focal_px if known else math.nan,
         "sd_focal_rel": known.sd_focal_rel if known else math.nan,
         "sd_k1": known.sd_k1 if known else math.nan,
         "focal_over_size": plausible.focal_over_size if plausible else math.nan,
         "folds_over": plausible.folds_over if plausible else None,
-        "expected_error_px": facts.expected_error_px if facts else math.nan,
+        "expected_error_px": quality.expected_error_px if quality else math.nan,
     }
 
 
@@ -184,7 +184,7 @@ def camera_row(audit: CameraAudit, labels: ModelLabels) -> Row:
         "num_images": len(audit.image_idxs),
         "num_points3d": audit.num_points,
         "num_observations": audit.num_observations,
-        **misfit_columns(audit.misfit.tests),
+        **misfit_columns(audit.tests),
         **cause_columns(audit.misfit),
         "advised_camera_model": audit.advised_camera_model,
         "misfit_material": bool(audit.misfit.material),
@@ -197,17 +197,15 @@ def model_row(
     tracks: ModelTracks,
     errors: StoredErrors,
     findings: Sequence[Finding],
-    judgements: Sequence[tuple[Judgement, Judgements]],
+    decisions: Sequence[Decision],
 ) -> Row:
-    """Return the row of one model; ``judgements`` holds each image's judgement of the policy and of each member."""
+    """Return the row of one model; ``decisions`` about its images."""
     total_sq = tracks.statistics.total_sq_px2
-    counts = {
-        "": Counter(policy.verdict for policy, _ in judgements),
-        "_ks": Counter(each.ks.verdict for _, each in judgements),
-        "_misfit": Counter(each.misfit.verdict for _, each in judgements),
-        "_pose": Counter(each.pose.verdict for _, each in judgements),
-        "_plausible": Counter(each.plausible.verdict for _, each in judgements),
-    }
+    counts = {"": Counter(decision.verdict for decision in decisions)}
+    for member in Member:
+        counts[f"_{member.short}"] = Counter(
+            verdict for decision in decisions if (verdict := decision.of(member)) is not None
+        )
     return {
         **asdict(labels),
         "file_format": model.file_format,

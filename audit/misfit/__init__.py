@@ -8,15 +8,15 @@ from sfm_audit.audit.misfit.cause import (
     bic,
     extended_camera,
     image_retest,
-    named_cause,
     remaining_groups,
 )
 from sfm_audit.audit.misfit.clusters import coincident_keypoints
-from sfm_audit.audit.misfit.fields import GROUPS, MisfitGroup, candidate_fields
+from sfm_audit.audit.misfit.fields import candidate_fields
 from sfm_audit.audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
-from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
+from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
 from sfm_audit.audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design
 from sfm_audit.audit.misfit.score import PreparedImage, prepare, prepare_image
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 
 __all__ = [
     "GROUPS",
@@ -38,7 +38,6 @@ __all__ = [
     "fitted_param_idxs",
     "image_design",
     "image_retest",
-    "named_cause",
     "nuisance_columns",
     "prepare",
     "prepare_image",

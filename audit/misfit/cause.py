@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.misfit.capabilities import TERMS, Term, extended_params, larger_models, undistorted_model
-from sfm_audit.audit.misfit.fields import GROUPS, MisfitGroup
 from sfm_audit.audit.misfit.multiplicity import holm
-from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests
+from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
 from sfm_audit.audit.misfit.score import prepare_image
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
@@ -37,23 +37,6 @@ def bic(test: MisfitTest, num_observations: int, sigma_px: float) -> float:
         return -math.inf
     gain = num_observations * (test.px / sigma_px) ** 2 if sigma_px > 0 else math.inf if test.px > 0 else 0.0
     return gain + test.rank - test.rank * math.log(2 * num_observations)
-
-
-def named_cause(
-    tests: Mapping[MisfitGroup, MisfitTest],
-    significant: Collection[MisfitGroup],
-    num_observations: int,
-    sigma_px: float,
-) -> MisfitGroup | None:
-    """Return the significant group with the largest BIC, None without significant groups.
-
-    A significant group is not yet the cause: a missing k2 also makes rolling_shutter significant. Tangential and
-    principal_point span nearly the same fields; either is named, and they count as one answer.
-    """
-    candidates = [group for group in GROUPS if group in significant and tests[group].status is MisfitStatus.TESTED]
-    if not candidates:
-        return None
-    return max(candidates, key=lambda group: bic(tests[group], num_observations, sigma_px))
 
 
 def remaining_groups(

@@ -6,28 +6,14 @@ explains it perfectly: no function here receives one.
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
 from sfm_audit.audit.misfit.nuisance import ProjectedImage
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import CameraRecord
-
-
-class MisfitGroup(StrEnum):
-    """The ways in which a camera model can be wrong, in the order of the tables."""
-
-    RADIAL = "radial"
-    TANGENTIAL = "tangential"
-    AFFINE = "affine"
-    PRINCIPAL_POINT = "principal_point"
-    ROLLING_SHUTTER = "rolling_shutter"
-    SMOOTH = "smooth"
-
-
-GROUPS: Final[tuple[MisfitGroup, ...]] = tuple(MisfitGroup)
 
 _MONOMIALS: Final = tuple((degree - j, j) for degree in range(1, 5) for j in range(degree + 1))
 _NUM_COLUMNS: Final = {

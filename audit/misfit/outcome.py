@@ -4,35 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
 
-from sfm_audit.audit.misfit.fields import MisfitGroup
+from sfm_audit.audit.table.words import MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 MIN_CLUSTERS_PER_RANK: Final = 4
 _SINGULAR_MEAT: Final = 1e-12  # smallest squared pivot of the meat with unit diagonal
-
-
-class MisfitStatus(StrEnum):
-    """Why a group has a p-value, or why not.
-
-    TESTED: p, px and rank are there.
-    ABSORBED: rank 0, the fitted parameters span the group: the camera model has it, or these points cannot show it.
-    NOT_ENOUGH_EVIDENCE: fewer than 4 observations (pooled: tracks) per rank, or fewer values than parameters.
-    SINGULAR: the scores do not vary in every direction of the group, for instance because all residuals are zero.
-    NOT_FINITE: a derivative is not finite.        NO_FIELDS: spherical cameras.
-    """
-
-    TESTED = "tested"
-    ABSORBED = "absorbed"
-    NOT_ENOUGH_EVIDENCE = "not_enough_evidence"
-    SINGULAR = "singular"
-    NOT_FINITE = "not_finite"
-    NO_FIELDS = "no_fields"
 
 
 class MisfitTest(NamedTuple):

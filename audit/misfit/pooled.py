@@ -15,9 +15,10 @@ from typing import Final, Literal
 import numpy as np
 
 from sfm_audit.audit.misfit import basis
-from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, GROUPS, NUM_FIELDS, MisfitGroup, candidate_fields
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
 from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, project_image
-from sfm_audit.audit.misfit.outcome import MisfitStatus, MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
+from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
 

@@ -11,6 +11,7 @@ from typing import Final, Literal
 import pyarrow as pa
 
 from sfm_audit.audit.table.arrow import build_table
+from sfm_audit.audit.table.words import GROUP_MEANINGS, Member, Verdict
 
 __all__ = [
     "CALIBRATION",
@@ -90,19 +91,10 @@ _IDENTITY: Final = (
     _text("model_path", "location of the model as given, joined with the path below it"),
 )
 
-_GROUPS: Final = {
-    "radial": "radial distortion beyond r^2",
-    "tangential": "tangential distortion",
-    "affine": "aspect ratio and skew",
-    "principal_point": "principal point",
-    "rolling_shutter": "a pose that changes from row to row",
-    "smooth": "any smooth field over the image",
-}
-
 
 def _misfit_groups() -> tuple[Column, ...]:
     out = []
-    for group, words in _GROUPS.items():
+    for group, words in GROUP_MEANINGS.items():
         out += [
             _number(f"misfit_{group}_p", f"p-value of the score test for {words}, on the model as it stands"),
             _px(f"misfit_{group}_px", f"RMS length of the field of {words} in the residuals, cleaned of noise"),
@@ -120,6 +112,19 @@ def _misfit() -> tuple[Column, ...]:
         _text("advised_camera_model", "smallest COLMAP model that holds what was found, or none: and what it is"),
     )
 
+
+REASON_DETAIL: Final = pa.struct(
+    [
+        ("code", pa.string()),
+        ("verdict", pa.string()),
+        ("value", pa.float64()),
+        ("limit", pa.float64()),
+        ("unit", pa.string()),
+        ("group", pa.string()),
+        ("text", pa.string()),
+    ]
+)
+"""One reason: its code, the verdict it speaks for, the number that triggered it, its limit, and the same in words."""
 
 IMAGES: Final[tuple[Column, ...]] = (
     *_IDENTITY,
@@ -189,7 +194,12 @@ IMAGES: Final[tuple[Column, ...]] = (
     _text("verdict_misfit", "rejected when a group has q < alpha and an effect above min_effect, after peeling"),
     _text("verdict_pose", "rejected when pose_offset_px is above its threshold"),
     _text("plausible", "rejected when this cannot be a camera, undetermined when the image says too little of it"),
+    _text("verdict_camera", "rejected when its own parameters are not at their optimum, or parts do not fit together"),
+    _text("verdict_noise", "rejected when the noise is visibly another one: ks_stat - 1.36 / sqrt(N) above 0.03"),
+    _text("verdict_outside", "rejected when witnesses outside of the image disagree; null where none was asked"),
+    _text("severity", "of a rejection: hard, medium or weak; null where no member rejects"),
     _texts("reasons", "why not accepted, and remarks: code, colon, and the number that triggered it"),
+    Column("reason_details", _list_of(REASON_DETAIL), "text", "reasons of all verdicts, the policy's or not"),
 )
 
 CAMERAS: Final[tuple[Column, ...]] = (
@@ -207,6 +217,11 @@ CAMERAS: Final[tuple[Column, ...]] = (
 )
 
 _FINDING: Final = pa.struct([("code", pa.string()), ("count", pa.int64()), ("text", pa.string())])
+
+_ORDER_OF_COUNTS: Final = (  # the first four as version 0.1.0 has them
+    *(Member.KS, Member.MISFIT, Member.POSE, Member.PLAUSIBLE),
+    *(Member.CAMERA, Member.NOISE, Member.OUTSIDE),
+)
 
 MODELS: Final[tuple[Column, ...]] = (
     *_IDENTITY,
@@ -230,14 +245,9 @@ MODELS: Final[tuple[Column, ...]] = (
     _count("num_rejected", "images whose verdict is rejected"),
     _count("num_undetermined", "images whose verdict is undetermined"),
     *(
-        _count(f"num_{verdict}_{member}", f"images whose {column} is {verdict}")
-        for member, column in (
-            ("ks", "verdict_ks"),
-            ("misfit", "verdict_misfit"),
-            ("pose", "verdict_pose"),
-            ("plausible", "plausible"),
-        )
-        for verdict in ("accepted", "rejected", "undetermined")
+        _count(f"num_{verdict}_{member.short}", f"images whose {member} is {verdict}")
+        for member in _ORDER_OF_COUNTS
+        for verdict in Verdict
     ),
     Column("findings", _list_of(_FINDING), "text", "inconsistencies of the model: code, how many items, one line each"),
 )
@@ -334,6 +344,7 @@ CALIBRATION: Final[tuple[Column, ...]] = (
     _text("verdict_pose", "rejected when pose_offset_px is above its threshold"),
     _text("plausible", "rejected when this cannot be a camera, undetermined when the points say too little of it"),
     _texts("reasons", "why not accepted, and remarks: code, colon, and the number that triggered it"),
+    Column("reason_details", _list_of(REASON_DETAIL), "text", "reasons of all verdicts, the policy's or not"),
 )
 
 CALIBRATION_RESIDUALS: Final[tuple[Column, ...]] = (

@@ -13,23 +13,19 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from sfm_audit.audit.table import TABLES
+from sfm_audit.audit.table.words import POLICIES, VERDICT_ORDER, Member, Verdict, is_remark, verdict_under
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.reports.run_folder.reader import Row, RunReader
-from sfm_audit.reports.text.explain import split_reason
-from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.reports.text.reasons import reasons_of
 from sfm_audit.reports.text.wording import natural_key
 
 MAX_ROWS: Final = 10_000  # of the image table
 MAX_SCENES: Final = 300
 MAX_CAMERAS: Final = 40
-VERDICTS: Final = ("accepted", "rejected", "undetermined")
-MEMBERS: Final = ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible")
-POLICIES: Final = {"full": MEMBERS, "camera": MEMBERS[1:], "paper": MEMBERS[:1]}
 DISTRIBUTIONS: Final = (
     *("sigma_predicted_px", "sigma_constant_px", "kurtosis_excess", "kurtosis_constant", "misfit_px", "scale_ratio"),
     *("ks_stat", "ks_constant_stat", "ks_p", "ks_constant_p"),
 )
-_RANK: Final = {"rejected": 0, "undetermined": 1, "accepted": 2}
 
 
 @dataclass(slots=True)
@@ -102,27 +98,22 @@ def severity(row: Row) -> tuple[Any, ...]:
     """Return a sort key: rejected first, then the largest misfit, then the largest KS distance, then by name."""
     misfit, distance = (row[name] if row[name] is not None else 0.0 for name in ("misfit_px", "ks_stat"))
     where = natural_key(row["scene"], row["component"], row["image_name"])
-    return (_RANK.get(row["verdict"], 1), -misfit, -distance, *where)
-
-
-def judged_under(row: Row, members: tuple[str, ...]) -> str:
-    """Return the verdict of a policy: rejected if a member rejects, else undetermined if one is, else accepted."""
-    return min((row[member] or "undetermined" for member in members), key=lambda verdict: _RANK.get(verdict, 1))
+    return (VERDICT_ORDER.get(row["verdict"], 1), -misfit, -distance, *where)
 
 
 def _count(content: RunContent, row: Row) -> None:
-    verdict = row["verdict"] or "undetermined"
+    verdict = row["verdict"] or Verdict.UNDETERMINED
     content.verdicts.append(verdict)
     content.noise_model = content.noise_model or row["noise_model"]
     content.scenes[row["dataset"], row["scene"]][verdict] += 1
-    for policy, members in POLICIES.items():
-        content.counts[f"policy {policy}"][judged_under(row, members)] += 1
-    for member in MEMBERS:
-        content.counts[member][row[member] or "undetermined"] += 1
+    for policy in POLICIES:
+        content.counts[f"policy {policy}"][verdict_under(policy, row)] += 1
+    for member in Member:
+        if row[member] is not None:  # it was asked
+            content.counts[member][row[member]] += 1
     details: dict[str, str] = {}
-    for reason in row["reasons"] or []:
-        code, detail = split_reason(reason)
-        details.setdefault(code, detail)
+    for reason in reasons_of(row):
+        details.setdefault(reason["code"], reason["text"])
     for code, detail in details.items():
         table = content.remarks if is_remark(code, row) else content.reasons
         if code in table:

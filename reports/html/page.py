@@ -13,13 +13,16 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 from sfm_audit.audit.table import TABLES
+from sfm_audit.audit.table.thresholds import ALPHA, effect_px
+from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICIES, Member, Verdict
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.reports import figures
-from sfm_audit.reports.html.content import MAX_CAMERAS, MAX_SCENES, MEMBERS, POLICIES, VERDICTS, Reason, RunContent
+from sfm_audit.reports.html.content import MAX_CAMERAS, MAX_SCENES, Reason, RunContent
 from sfm_audit.reports.html.pictures import ImagePictures, Picture
 from sfm_audit.reports.html.svg import to_svg
 from sfm_audit.reports.run_folder.reader import Row
-from sfm_audit.reports.text.explain import LIMITS, QUESTIONS, plain_reason, split_reason
+from sfm_audit.reports.text.explain import LIMITS, plain_reason
+from sfm_audit.reports.text.reasons import reasons_of
 from sfm_audit.reports.text.wording import counted, number, plain, px
 
 _PANEL_ONLY: Final = (
@@ -28,7 +31,7 @@ _PANEL_ONLY: Final = (
     *("median_px", "p95_px", "max_px", "sigma_constant_px", "sigma_d_px", "scale_ratio"),
     *("ks_stat", "ks_q", "ks_fitted_p", "dap_p", "sw_p", "skewness", "ks_constant_stat", "ks_constant_p"),
     *("kurtosis_constant", "misfit_group", "misfit_q", "sd_focal_rel", "focal_over_size", "expected_error_px"),
-    *MEMBERS,
+    *(str(member) for member in Member),
 )
 _DIGITS: Final = 5  # significant, in the numbers on the page
 
@@ -87,7 +90,7 @@ def render_page(page: PageInput) -> str:
         version=content.run.info["version"],
         complete=content.run.info.get("status") == "complete",
         config=content.config,
-        totals={verdict: content.verdicts.count(verdict) for verdict in VERDICTS},
+        totals={verdict: content.verdicts.count(verdict) for verdict in Verdict},
         num_images=content.num_images,
         summary=counted(content.num_images, "image") + " in " + counted(len(content.models), "model"),
         questions=_questions(content),
@@ -129,22 +132,24 @@ def _asset(name: str) -> str:
 
 def _questions(content: RunContent) -> list[dict[str, Any]]:
     policy = content.config.get("policy")
-    named = [(f"policy {name}", ", ".join(m.removeprefix("verdict_") for m in POLICIES[name])) for name in POLICIES]
-    rows = [*named, *((name, QUESTIONS[name]) for name in MEMBERS)]
+    named = [(f"policy {name}", ", ".join(member.short for member in members)) for name, members in POLICIES.items()]
+    rows = [*named, *((str(member), question) for member, question in MEMBER_QUESTIONS.items())]
     return [
         {"name": name, "words": words, "decides": name == f"policy {policy}", **_shares(content.counts[name])}
         for name, words in rows
+        if content.counts[name]
     ]
 
 
 def _shares(counts: Mapping[str, int]) -> dict[str, Any]:
     total = sum(counts.values())
     share = 100.0 * counts.get("rejected", 0) / total if total else 0.0
-    return {**{verdict: counts.get(verdict, 0) for verdict in VERDICTS}, "total": total, "share": f"{share:.0f} %"}
+    return {**{verdict: counts.get(verdict, 0) for verdict in Verdict}, "total": total, "share": f"{share:.0f} %"}
 
 
 def _verdict_figure(content: RunContent) -> Markup:
-    counts = {name: content.counts[name] for name in (*(f"policy {name}" for name in POLICIES), *MEMBERS)}
+    names = (*(f"policy {name}" for name in POLICIES), *map(str, Member))
+    counts = {name: content.counts[name] for name in names if content.counts[name]}
     return to_svg(figures.verdict_bars(counts), key="verdicts", label="Verdicts by policy and question; see the table")
 
 
@@ -169,7 +174,7 @@ def _reason_rows(reasons: Mapping[str, Reason]) -> list[dict[str, Any]]:
 def _distributions(content: RunContent) -> list[Picture]:
     numbers, verdicts = content.numbers, content.verdicts
     noise = content.noise_model or "chosen"
-    alpha = float(content.config.get("alpha", 0.05))
+    alpha = float(content.config.get("alpha", ALPHA.default))
     tau = _tau_px(content.config, None)
     marks = {f"matters above {tau:g} px": tau} if tau else {}
     p_columns = {"noise_model": [content.noise_model], **{name: numbers[name] for name in ("ks_p", "ks_constant_p")}}
@@ -202,19 +207,15 @@ def _distributions(content: RunContent) -> list[Picture]:
 
 def _tau_px(config: Mapping[str, Any], sigma_px: float | None) -> float | None:
     """Return the effect that matters, px; None where it is in sigma and the noise is not known."""
-    effect = str(config.get("min_effect", ""))
-    if effect.endswith("px"):
-        return float(effect.removesuffix("px"))
-    if effect.endswith("sigma") and sigma_px is not None:
-        return float(effect.removesuffix("sigma")) * sigma_px
-    return None
+    effect = config.get("min_effect")
+    return None if effect is None else effect_px(str(effect), sigma_px)
 
 
 def _camera(index: int, row: Row, config: Mapping[str, Any]) -> dict[str, Any]:
     model = BY_NAME.get(row["camera_model"])
     names = model.param_names if model else ()
     tau = _tau_px(config, None)
-    figure = figures.misfit_groups(row, tau_px=tau, alpha=float(config.get("alpha", 0.05)))
+    figure = figures.misfit_groups(row, tau_px=tau, alpha=float(config.get("alpha", ALPHA.default)))
     label = f"Systematic residuals by kind of misfit, all images of camera {row['camera_id']} together"
     group = row["misfit_group"]
     return {
@@ -236,7 +237,7 @@ def _worst(index: int, row: Row, pictures: ImagePictures) -> dict[str, Any]:
         "name": plain(row["image_name"]),
         "place": plain(f"{row['scene']}/{row['component']}"),
         "verdict": row["verdict"],
-        "reasons": [plain_reason(reason, row) for reason in row["reasons"] or []],
+        "reasons": [plain_reason(reason, row) for reason in reasons_of(row)],
         "facts": f"{row['num_inliers']} inliers, RMS {px(row['rms_px'])} px, "
         f"predicted noise {px(row['sigma_predicted_px'])} px, coverage {number(row['coverage'])}",
         "pictures": pictures.pictures,
@@ -273,11 +274,11 @@ def _payload(content: RunContent, num_pictures: int) -> Markup:
 
 
 def _codes(row: Row) -> list[str]:
-    return list(dict.fromkeys(split_reason(reason)[0] for reason in row["reasons"] or []))
+    return list(dict.fromkeys(reason["code"] for reason in reasons_of(row)))
 
 
 def _sentences(row: Row) -> list[str]:
-    return [plain_reason(reason, row) for reason in row["reasons"] or []]
+    return [plain_reason(reason, row) for reason in reasons_of(row)]
 
 
 def _value(value: Any) -> Any:

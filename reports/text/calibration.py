@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
+from sfm_audit.audit.table.words import is_remark
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
-from sfm_audit.reports.text.reasons import is_remark
 from sfm_audit.reports.text.summary import SHORT_GROUP, VERDICT_STYLE
 from sfm_audit.reports.text.wording import MISSING, counted, number, paragraph, plain, probability, px
 

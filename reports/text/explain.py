@@ -10,9 +10,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfm_audit.audit.table.words import (
+    MEMBER_QUESTIONS,
+    MISFIT_CODES,
+    Member,
+    MisfitGroup,
+    ReasonCode,
+    Verdict,
+    is_remark,
+)
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
-from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.reports.text.reasons import reasons_of
 from sfm_audit.reports.text.wording import number, paragraph, plain, probability, px
 
 LIMITS: Final = (
@@ -59,50 +68,35 @@ _WORDS: Final = {
     "degenerate_input": "its points determine no camera ({detail})",
 }
 REASON_CODES: Final = frozenset(_WORDS)
-QUESTIONS: Final = {
-    "verdict_ks": "Is the noise what the noise model says?",
-    "verdict_misfit": "Does the camera model hold?",
-    "verdict_pose": "Is the pose at its optimum?",
-    "plausible": "Is it a camera, and well observed?",
-}
-"""The four verdicts behind the policy, as questions."""
 
-_MISFIT: Final = re.compile(r"(?P<px>[0-9.]+) px, q = (?P<q>[-+0-9.e]+)(?P<also> \(also .*\))?")
-_POSE: Final = re.compile(r"pose_offset_px = (?P<px>[0-9.]+) > (?P<limit>[0-9.]+)")
 _CENTRE: Final = 0.35  # of the half diagonal
 _CORNER: Final = 0.75
 _CLEARLY: Final = 1.35  # times the RMS over the whole image
 
 
-def split_reason(reason: str) -> tuple[str, str]:
-    """Return code and detail of a reason as the tables have it."""
-    code, _, detail = reason.partition(":")
-    return code, detail.strip()
-
-
-def plain_reason(reason: str, row: Mapping[str, Any], *, where: str | None = None) -> str:
+def plain_reason(reason: Mapping[str, Any], row: Mapping[str, Any], *, where: str | None = None) -> str:
     """Say one reason in plain words, with the numbers that triggered it.
 
     Parameters
     ----------
-    reason : as in the column ``reasons``
+    reason : of `reasons_of`
     row : the image's row of ``RUN/images``
     where : where in the image a misfit is strongest, from `strongest_where`
     """
-    code, detail = split_reason(reason)
+    code, detail = reason["code"], reason["text"]
     words = _WORDS.get(code)
     if words is None:
-        return plain(reason)
+        return plain(f"{code}: {detail}")
     model = row["camera_model"] or "the camera"
     said = words.format(
-        detail=_pose_words(detail) if code == "pose_not_optimal" else detail,
+        detail=_pose_words(reason) if code == ReasonCode.POSE_NOT_OPTIMAL else detail,
         model=model,
-        size=_size_words(detail, where),
+        size=_size_words(reason, row, where),
         lens=_lens_words(str(model)),
         tails=_tails(row),
     )
     advice = row["advised_camera_model"]
-    if code.startswith("misfit_") and advice and code != "misfit_not_tested":
+    if code in MISFIT_CODES.values() and advice:
         said += f"; {_advice_words(str(advice))}"
     return plain(said)
 
@@ -142,9 +136,9 @@ class Story:
 def render_story(story: Story, width: int = 100) -> str:
     """Return the whole story of one image as text."""
     row = story.row
-    reasons = [split_reason(reason)[0] for reason in row["reasons"]]
-    decide = [r for r, code in zip(row["reasons"], reasons, strict=True) if not is_remark(code, dict(row))]
-    remarks = [reason for reason in row["reasons"] if reason not in decide]
+    reasons = reasons_of(dict(row))
+    decide = [reason for reason in reasons if not is_remark(reason["code"], row)]
+    remarks = [reason for reason in reasons if is_remark(reason["code"], row)]
     parts = [
         _heading(story, width),
         _bullets("Why", decide, story, width) if decide else "Why\n  nothing speaks against it",
@@ -161,17 +155,20 @@ def render_story(story: Story, width: int = 100) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _size_words(detail: str, where: str | None) -> str:
-    match = _MISFIT.fullmatch(detail)
-    if match is None:
-        return detail
-    also = (match["also"] or "").replace(" (also ", "; also ").rstrip(")").replace("_", " ")
-    return f"{match['px']} px RMS" + (f", {where}" if where else "") + f" (q = {match['q']}{also})"
+def _size_words(reason: Mapping[str, Any], row: Mapping[str, Any], where: str | None) -> str:
+    """Say how large a misfit is; ``also``: the other groups that matter, as the text of the reason has them."""
+    if reason["value"] is None:
+        return str(reason["text"])
+    _, _, also = str(reason["text"]).partition("(also ")
+    said = f"; also {also.rstrip(')').replace('_', ' ')}" if also else ""
+    q = f" (q = {row['misfit_q']:.2g}{said})" if row["misfit_q"] is not None else ""
+    return f"{reason['value']:.2f} px RMS" + (f", {where}" if where else "") + q
 
 
-def _pose_words(detail: str) -> str:
-    match = _POSE.fullmatch(detail)
-    return f"{match['px']} > {match['limit']}" if match else detail
+def _pose_words(reason: Mapping[str, Any]) -> str:
+    if reason["value"] is None or reason["limit"] is None:
+        return str(reason["text"])
+    return f"{reason['value']:.3g} > {reason['limit']:g}"
 
 
 def _lens_words(model: str) -> str:
@@ -215,13 +212,14 @@ def _heading(story: Story, width: int) -> str:
     return "\n".join(paragraph(line, width, "  ") for line in lines)
 
 
-def _bullets(title: str, reasons: Sequence[str], story: Story, width: int) -> str:
+def _bullets(title: str, reasons: Sequence[Mapping[str, Any]], story: Story, width: int) -> str:
     lines = [paragraph(f"- {plain_reason(r, story.row, where=story.where)}", width, "  ") for r in reasons]
     return "\n".join([title, *lines])
 
 
 def _verdict_lines(row: Mapping[str, Any]) -> str:
-    return "\n".join(["The four questions", *(f"  {words:<42}{row[name]}" for name, words in QUESTIONS.items())])
+    asked = {words: row[member] for member, words in MEMBER_QUESTIONS.items() if row[member] is not None}
+    return "\n".join(["The questions, one by one", *(f"  {words:<54}{verdict}" for words, verdict in asked.items())])
 
 
 def _camera_lines(row: Mapping[str, Any], width: int) -> str:
@@ -233,7 +231,7 @@ def _camera_lines(row: Mapping[str, Any], width: int) -> str:
     size = f"{row['width']} x {row['height']} px"
     text = f"  camera {row['camera_id']}: {camera.name}, {size}, {params}"
     advice = row["advised_camera_model"]
-    if advice and row["verdict_misfit"] != "rejected":
+    if advice and row[Member.MISFIT] != Verdict.REJECTED:
         text += f". {advice} would say as much: the distortion is not identified"
     return "\n".join(["Camera", paragraph(text, width, "    ")])
 
@@ -296,10 +294,9 @@ def _series(row: Mapping[str, Any], show: Any, *names: str) -> str:
 
 
 def _misfit_lines(row: Mapping[str, Any], config: Mapping[str, Any], where: str | None) -> str:
-    groups = [name.removeprefix("misfit_").removesuffix("_px") for name in row if re.fullmatch(r"misfit_.+_px", name)]
     tau = config.get("min_effect")
     lines = [f"Misfit: what of the residuals is systematic (matters above {tau})"]
-    for group in groups:
+    for group in MisfitGroup:
         size, p, rank = row[f"misfit_{group}_px"], row[f"misfit_{group}_p"], row[f"misfit_{group}_rank"]
         if size is not None:
             said = f"{px(size)} px RMS, p = {probability(p)}"

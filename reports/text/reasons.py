@@ -6,18 +6,27 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
+from sfm_audit.audit.table.words import Member, Verdict, is_remark
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.wording import counted, paragraph, plain, shorten
 
-REASON_COLUMNS: Final = ("image_name", "verdict_misfit", "advised_camera_model", "reasons")
+REASON_COLUMNS: Final = ("image_name", str(Member.MISFIT), "advised_camera_model", "reasons")
 MAX_ADVICE: Final = 3
-_REMARKS: Final = frozenset({"k1_not_identified", "fronto_parallel"})
-_NOT_TESTED: Final = "misfit_not_tested"  # a reason where no lens group ran, a remark everywhere else
 
 
-def is_remark(code: str, row: Row) -> bool:
-    """Whether a reason code decides nothing in this image (docs/verdicts.md)."""
-    return code in _REMARKS or (code == _NOT_TESTED and row["verdict_misfit"] != "undetermined")
+def reasons_of(row: Row) -> list[Row]:
+    """Return the reasons in a row of the images table as records: those of its verdict, in their order.
+
+    A run of an older version has no column ``reason_details``; its reasons then are a code and a text.
+    """
+    details = {f"{item['code']}: {item['text']}": item for item in reversed(row.get("reason_details") or [])}
+    return [details[said] if said in details else _undetailed(said) for said in row["reasons"] or []]
+
+
+def _undetailed(said: str) -> Row:
+    code, _, text = said.partition(":")
+    empty = dict.fromkeys(("verdict", "value", "limit", "unit", "group"))
+    return {**empty, "code": code, "text": text.strip()}
 
 
 @dataclass(slots=True)
@@ -48,13 +57,12 @@ def reasons_part(run: RunReader, width: int) -> list[str]:
     simpler: Counter[str] = Counter()
     for row in run.rows("images", REASON_COLUMNS):
         details: dict[str, str] = {}
-        for reason in row["reasons"] or []:
-            code, _, detail = reason.partition(":")
-            details.setdefault(code, detail.strip())  # two verdicts may give one code; the image counts once
+        for reason in reasons_of(row):
+            details.setdefault(reason["code"], reason["text"])  # two verdicts may give one code; it counts once
         for code, detail in details.items():
             (remarks if is_remark(code, row) else reasons).add(code, detail, row["image_name"])
         if row["advised_camera_model"] is not None:
-            (fixing if row["verdict_misfit"] == "rejected" else simpler)[row["advised_camera_model"]] += 1
+            (fixing if row[Member.MISFIT] == Verdict.REJECTED else simpler)[row["advised_camera_model"]] += 1
     advice = [
         *_advice("with a misfit that matters", fixing, width),
         *_advice("where less would do", simpler, width),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, VERDICT_ORDER, Member, Verdict
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
 from sfm_audit.reports.text.reasons import reasons_part
@@ -26,29 +27,21 @@ from sfm_audit.reports.text.wording import (
     shorten,
 )
 
-VERDICT_ORDER: Final = {"rejected": 0, "undetermined": 1, "accepted": 2}
-VERDICT_STYLE: Final = {"rejected": "red", "undetermined": "yellow", "accepted": "green"}
-VERDICTS: Final = {
-    "ks": ("verdict_ks", "is the noise what the noise model says?"),
-    "misfit": ("verdict_misfit", "does the camera model hold?"),
-    "pose": ("verdict_pose", "is the pose at its optimum?"),
-    "plausible": ("plausible", "is it a camera, and well observed?"),
-}
-POLICIES: Final = {
-    "paper": "verdict_ks alone",
-    "camera": "misfit, pose and plausible",
-    "full": "all four",
+VERDICT_STYLE: Final[dict[str, str]] = {
+    Verdict.REJECTED: "red",
+    Verdict.UNDETERMINED: "yellow",
+    Verdict.ACCEPTED: "green",
 }
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "num_accepted", "num_rejected", "num_undetermined"),
     *("stored_error_px", "recomputed_point_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
     "num_nonstationary_images",
-    *(f"num_{verdict}_{member}" for member in VERDICTS for verdict in VERDICT_ORDER),
+    *(f"num_{verdict}_{member.short}" for member in Member for verdict in Verdict),
 )
 IMAGE_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "image_name", "num_inliers", "rms_px", "sigma_predicted_px"),
     *("sigma_constant_px", "noise_model", "ks_stat", "ks_p", "misfit_group", "misfit_px", "pose_offset_px"),
-    *("coverage", "verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible"),
+    *("coverage", "verdict", *map(str, Member)),
 )
 CAMERA_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "camera_id", "camera_model", "num_images"),
@@ -196,11 +189,14 @@ def _verdicts_part(run: RunReader, models: _Models, page: Page) -> list[str]:
     if not models.num_models:
         return []
     policy = run.info["config"]["policy"]
-    asked = [(f"_{member}", column, question) for member, (column, question) in VERDICTS.items()]
-    asked.append(("", f"policy {policy}", POLICIES[policy]))
+    asked = [
+        (f"_{member.short}", str(member), question[0].lower() + question[1:])
+        for member, question in MEMBER_QUESTIONS.items()
+        if any(models.sums[f"num_{verdict}_{member.short}"] for verdict in Verdict)
+    ]
+    asked.append(("", f"policy {policy}", POLICY_WORDS.get(policy, "")))
     rows: list[Row] = [
-        {**{v: models.sums[f"num_{v}{suffix}"] for v in VERDICT_ORDER}, "question": question}
-        for suffix, _, question in asked
+        {**{v: models.sums[f"num_{v}{suffix}"] for v in Verdict}, "question": question} for suffix, _, question in asked
     ]
     fields = [
         Field("ac-\ncepted", lambda r: str(r["accepted"])),
@@ -228,13 +224,13 @@ def _images_part(run: RunReader, models: _Models, page: Page) -> list[str]:
         Field("in-\nliers", lambda r: str(r["num_inliers"])),
         Field("rms\npx", lambda r: px(r["rms_px"])),
         Field("noise\npx", lambda r: px(_noise_px(r))),
-        Field("KS\np", lambda r: probability(r["ks_p"]), lambda r: VERDICT_STYLE.get(r["verdict_ks"], "")),
-        Field("misfit\npx", _misfit, lambda r: VERDICT_STYLE.get(r["verdict_misfit"], "")),
-        Field("pose\npx", lambda r: number(r["pose_offset_px"]), lambda r: VERDICT_STYLE.get(r["verdict_pose"], "")),
+        Field("KS\np", lambda r: probability(r["ks_p"]), lambda r: VERDICT_STYLE.get(r[Member.KS], "")),
+        Field("misfit\npx", _misfit, lambda r: VERDICT_STYLE.get(r[Member.MISFIT], "")),
+        Field("pose\npx", lambda r: number(r["pose_offset_px"]), lambda r: VERDICT_STYLE.get(r[Member.POSE], "")),
         Field(
             "cover-\nage",
             lambda r: number(r["coverage"]),
-            lambda r: VERDICT_STYLE.get(r["plausible"], ""),
+            lambda r: VERDICT_STYLE.get(r[Member.PLAUSIBLE], ""),
             optional=True,
         ),
     ]

@@ -63,7 +63,7 @@ def protection_rows(design: BoardDesign, seed: int) -> pd.DataFrame:
     for k, board in enumerate(boards):
         for name in MODELS:
             estimate = estimator(name)(board.correspondences, np.random.default_rng([seed, k]))
-            measured = validate(estimate, board.correspondences).misfit.tests
+            measured = validate(estimate, board.correspondences).tests
             for points, tests in zip(PROTECTIONS, (_as_exact_points(estimate, board), measured), strict=True):
                 p = holm(np.array([tests[group].p for group in GROUPS]))
                 about = {"model": name, "third": third[k], "points": points}

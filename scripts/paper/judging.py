@@ -9,8 +9,10 @@ from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimator
 from sfm_audit.audit.calibrate.lidar import lidar_predictors
 from sfm_audit.audit.calibrate.validation import Validation, validate
 from sfm_audit.audit.misfit import GROUPS, MisfitStatus
+from sfm_audit.audit.misfit.multiplicity import holm
 from sfm_audit.audit.noise.variants import fit_variance_literal
 from sfm_audit.audit.normality import ks
+from sfm_audit.audit.table.words import Member
 from sfm_audit.loaders.correspondences.records import Correspondences
 
 Row = dict[str, object]
@@ -41,14 +43,14 @@ def numbers_of(found: Validation) -> Row:
         row |= {f"{test}_{scale}": getattr(standardised.tests, f"{test}_p") for test in TESTS}
         row[f"D_{scale}"] = standardised.tests.ks_stat
     for group in GROUPS:
-        test = found.misfit.tests[group]
+        test = found.tests[group]
         row |= {f"{group}_p": test.p, f"{group}_px": test.px, f"{group}_ran": test.status is MisfitStatus.TESTED}
-    row["misfit_p"] = float(np.nanmin(list(found.misfit.q.values()))) if found.misfit.q else float("nan")
+    row["misfit_p"] = float(np.nanmin(holm(np.array([found.tests[group].p for group in GROUPS]))))
     row["misfit_group"] = str(found.misfit.group) if found.misfit.group else "none"
     row["misfit_px"], row["tau"] = found.misfit.px, found.tau_px
-    row["verdict_misfit"] = str(found.judgements.misfit.verdict)
-    row["verdict_ks"] = str(found.judgements.ks.verdict)
-    row["plausible"] = str(found.judgements.plausible.verdict)
+    row["verdict_misfit"] = str(found.decision.of(Member.MISFIT))
+    row["verdict_ks"] = str(found.decision.of(Member.KS))
+    row["plausible"] = str(found.decision.of(Member.PLAUSIBLE))
     row["olsson_rejects"] = not found.olsson_accepts
     return row
 

@@ -21,6 +21,7 @@ from sfm_audit.audit.simulate.defects import (
 )
 from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
 from sfm_audit.audit.simulate.truth import TrueCameras, claimed_params_of, project_true, true_model_of
+from sfm_audit.audit.table.words import Member
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet
@@ -33,6 +34,7 @@ NORMALITY = ("ks", "ks_fitted", "ks_norm", "dap", "sw")
 EXACT_DEFECTS = {DefectKind.RADIAL_K2: (0.05,), DefectKind.TANGENTIAL: (1e-3, 1e-3)}
 _SEED_SIZE, _SEED_POWER, _SEED_EXACT = 1, 2, 3
 _MAX_STEPS, _STEP_TOLERANCE_PX = 20, 1e-7
+MEMBERS = {"ks": Member.KS, "misfit": Member.MISFIT, "pose": Member.POSE, "plausible": Member.PLAUSIBLE}
 
 
 def sound_camera() -> TrueCameras:
@@ -81,16 +83,16 @@ def audit_points(xyz: FloatArray, xy_px: FloatArray) -> ImageAudit:
 
 def row_of(audit: ImageAudit) -> dict[str, object]:
     """What the study keeps of one image."""
-    if audit.facts is None or audit.opinion is None:
+    if audit.quality is None or audit.misfit is None:
         raise ValueError("an image without inliers")
     row: dict[str, object] = {f"{name}_p": getattr(audit.tests, f"{name}_p") for name in NORMALITY}
     for group in GROUPS:
-        row[f"misfit_{group}_p"], row[f"misfit_{group}_px"] = audit.facts.misfit[group][:2]
-    row["misfit_group"] = str(audit.opinion.misfit.group) if audit.opinion.misfit.group else None
-    for name in ("ks", "misfit", "pose", "plausible"):
-        row[f"verdict_{name}"] = str(getattr(audit.judgements, name).verdict)
-    row["policy_camera"] = str(audit.judgements.under("camera").verdict)
-    row["policy_full"] = str(audit.judgements.under("full").verdict)
+        row[f"misfit_{group}_p"], row[f"misfit_{group}_px"] = audit.quality.misfit[group][:2]
+    row["misfit_group"] = audit.misfit.group
+    for name, member in MEMBERS.items():
+        row[f"verdict_{name}"] = str(audit.decision.of(member))
+    row["policy_camera"] = str(audit.decision.under("camera").verdict)
+    row["policy_full"] = str(audit.decision.under("full").verdict)
     return row
 
 

@@ -6,9 +6,9 @@ from scipy import stats
 
 from sfm_audit.audit.calibrate.estimators import estimator
 from sfm_audit.audit.calibrate.validation import validate
-from sfm_audit.audit.decision.verdict import Verdict
 from sfm_audit.audit.misfit import GROUPS, MisfitStatus
 from sfm_audit.audit.simulate.board import BoardSpec, board_sets
+from sfm_audit.audit.table.words import Member, Verdict
 
 SETS = 28
 SEEDS = range(4)
@@ -29,24 +29,24 @@ def test_right_cameras_are_rejected_as_often_as_the_level_says(noise):
     found = [v for v in validated("D3", noise) if v.identifiability.sd_focal_rel <= 0.01]
     assert len(found) > 100
     for group in GROUPS:
-        tests = [v.misfit.tests[group] for v in found if v.misfit.tests[group].status is MisfitStatus.TESTED]
+        tests = [v.tests[group] for v in found if v.tests[group].status is MisfitStatus.TESTED]
         rejected = sum(test.p < 0.05 for test in tests)
         assert rejected <= stats.binom.ppf(1 - 1e-4, max(len(tests), 1), 0.07), (group, rejected, len(tests))
-    pooled = [v.misfit.tests[g].p for v in found for g in GROUPS if v.misfit.tests[g].status is MisfitStatus.TESTED]
+    pooled = [v.tests[g].p for v in found for g in GROUPS if v.tests[g].status is MisfitStatus.TESTED]
     share = float(np.mean(np.array(pooled) < 0.05))
     assert 0.02 < share < 0.07
-    assert sum(v.judgements.ks.verdict == Verdict.REJECTED for v in found) <= 2
-    assert sum(v.judgements.misfit.verdict == Verdict.REJECTED for v in found) <= 0.06 * len(found)
+    assert sum(v.decision.of(Member.KS) == Verdict.REJECTED for v in found) <= 2
+    assert sum(v.decision.of(Member.MISFIT) == Verdict.REJECTED for v in found) <= 0.06 * len(found)
 
 
 def test_wrong_lenses_are_found_where_the_board_is_near():
     """D(1,0) on boards of the upper two thirds by coverage. KS, the paper's decision, finds none of them."""
     found = validated("D1", seeds=range(2))
     near = [v for v in found if v.coverage > np.quantile([u.coverage for u in found], 1 / 3)]
-    by_misfit = [v.judgements.misfit.verdict == Verdict.REJECTED for v in near]
+    by_misfit = [v.decision.of(Member.MISFIT) == Verdict.REJECTED for v in near]
     assert np.mean(by_misfit) >= 0.9
     assert np.mean([v.misfit.group == "radial" for v in near if v.misfit.group]) > 0.9
-    assert np.mean([v.judgements.ks.verdict == Verdict.REJECTED for v in near]) < 0.1
+    assert np.mean([v.decision.of(Member.KS) == Verdict.REJECTED for v in near]) < 0.1
 
 
 def test_the_predicted_sd_follows_the_empirical_one_under_the_right_model():

@@ -13,7 +13,7 @@ from calibrate_doubles import board, true_camera
 
 from sfm_audit.audit.cli.main import main
 from sfm_audit.audit.table import CALIBRATION, CALIBRATION_RESIDUALS
-from sfm_audit.reports.text.reasons import is_remark
+from sfm_audit.audit.table.words import is_remark
 
 PNG = b"\x89PNG"
 FIGURES = (

@@ -22,10 +22,10 @@ from sfm_audit.audit.calibrate.undistort import undistort_image, undistort_map
 from sfm_audit.audit.calibrate.validation import DEFAULTS, validate
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map
 from sfm_audit.audit.camera_quality.plausibility import folds_over
-from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
 from sfm_audit.audit.misfit import MisfitGroup, MisfitStatus, candidate_fields, prepare
 from sfm_audit.audit.noise.standardise import constant_noise
 from sfm_audit.audit.table import CALIBRATION, CALIBRATION_RESIDUALS, schema
+from sfm_audit.audit.table.words import Member, ReasonCode, Verdict
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.model import CameraRecord
 from sfm_audit.reports.text.calibration import render_calibration
@@ -53,21 +53,21 @@ def codes(judgement):
 
 def test_a_right_camera_is_accepted_and_its_noise_known():
     found = validate(*estimated("D3"))
-    assert (found.verdict, found.judgement.reasons) == (ACCEPTED, ())
+    assert (found.verdict, found.decision.reasons) == (ACCEPTED, ())
     assert found.noise_name == "constant"
     assert 0.027 < found.sd_px < 0.033
     assert found.robust.sd_px == pytest.approx(found.sd_px, rel=0.1)
     assert found.plain.sd_px == found.sd_px
     assert found.pose_offset_px < 1e-6
-    radial = found.misfit.tests[MisfitGroup.RADIAL]
+    radial = found.tests[MisfitGroup.RADIAL]
     assert (radial.status, radial.rank) == (MisfitStatus.ABSORBED, 0)
 
 
 def test_a_lens_of_one_coefficient_is_rejected_by_misfit_alone():
     found = validate(*estimated("D1"))
-    assert found.judgements.misfit.verdict == REJECTED
-    assert codes(found.judgements.misfit)[0] == ReasonCode.MISFIT_RADIAL
-    assert found.judgements.pose.verdict == ACCEPTED
+    assert found.decision.of(Member.MISFIT) == REJECTED
+    assert codes(found.decision.members[Member.MISFIT])[0] == ReasonCode.MISFIT_RADIAL
+    assert found.decision.of(Member.POSE) == ACCEPTED
     assert found.olsson_accepts  # the rule that the paper argues against
 
 
@@ -99,8 +99,8 @@ def test_the_world_s_unit_and_frame_do_not_matter(scale, turn):
     t = scale * (estimate.translation_cam_from_world - r @ shift)
     other = dataclasses.replace(correspondences, xyz_world=world)
     there = validate(estimate_of("D1", estimate.camera, r, t, other, estimate.inliers), other)
-    for group, test in here.misfit.tests.items():
-        assert_allclose(there.misfit.tests[group].p, test.p, rtol=1e-5)
+    for group, test in here.tests.items():
+        assert_allclose(there.tests[group].p, test.p, rtol=1e-5)
     assert_allclose(there.identifiability.sd_focal_rel, here.identifiability.sd_focal_rel, rtol=1e-6)
     assert_allclose(there.expected_error.error_px, here.expected_error.error_px, rtol=1e-6)
     assert_allclose(there.geometry.tilt_deg, here.geometry.tilt_deg, rtol=1e-6)
@@ -132,7 +132,7 @@ def test_a_fronto_parallel_board_determines_no_focal_length():
 def test_a_moved_pose_is_rejected():
     estimate, correspondences = estimated("D3")
     found = validate(moved(estimate, correspondences, np.array([0.003, 0.0, 0.0])), correspondences)
-    assert found.judgements.pose.verdict == REJECTED
+    assert found.decision.of(Member.POSE) == REJECTED
     assert found.pose_offset_px > 0.5
 
 
@@ -145,7 +145,7 @@ def test_too_few_and_too_exact():
     exact, rotation, translation = board(np.random.default_rng(0), noise_px=0.0)
     estimate = estimate_of("D3", true_camera(), rotation, translation, exact, np.ones(exact.num, dtype=bool))
     found = validate(estimate, exact)
-    assert found.judgements.ks.verdict == found.judgements.misfit.verdict == UNDETERMINED
+    assert found.decision.of(Member.KS) == found.decision.of(Member.MISFIT) == UNDETERMINED
     assert ReasonCode.EXACT_PROJECTIONS in codes(found.judgement)
 
 
@@ -278,16 +278,16 @@ def test_a_neighbour_without_image_costs_its_own_row_only():
     pan[:5, 2] -= 100.0  # behind the camera
     found = validate(estimate, dataclasses.replace(near, pan_xyz_world=pan))
     assert found.robust.tests.num_values == 2 * (correspondences.num - 5)
-    assert found.judgements.ks.verdict == ACCEPTED
+    assert found.decision.of(Member.KS) == ACCEPTED
     assert math.isfinite(found.robust.sd_px)
 
 
 def test_tau_and_alpha_are_settings():
     estimate, correspondences = estimated("D1", extent=0.5)
-    assert validate(estimate, correspondences).judgements.misfit.verdict == REJECTED
+    assert validate(estimate, correspondences).decision.members[Member.MISFIT].verdict == REJECTED
     coarse = DEFAULTS.model_copy(update={"min_effect": "9px"})
     found = validate(estimate, correspondences, config=coarse)
-    assert found.judgements.misfit.verdict == ACCEPTED
+    assert found.decision.of(Member.MISFIT) == ACCEPTED
     assert (found.misfit.group, found.tau_px) == (MisfitGroup.RADIAL, 9.0)
     assert (
         validate(estimate, correspondences, config=DEFAULTS.model_copy(update={"policy": "paper"})).verdict == ACCEPTED

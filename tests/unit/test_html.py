@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from report_samples import NASTY_NAMES, read_sample
 
+from sfm_audit.audit.table.words import strongest
 from sfm_audit.reports import html
 from sfm_audit.reports.figures import Residuals, residual_vectors
-from sfm_audit.reports.html.content import judged_under
 from sfm_audit.reports.html.photos import find_photo, read_photo
 from sfm_audit.reports.html.svg import to_svg
 from sfm_audit.reports.text.wording import plain
@@ -131,7 +131,7 @@ def test_counts_are_the_tables(nasty):
     ],
 )
 def test_a_policy_is_as_strict_as_its_strictest_member(verdicts, expected):
-    assert judged_under({"a": verdicts[0], "b": verdicts[1]}, ("a", "b")) == expected
+    assert strongest(verdicts) == expected
 
 
 def test_more_rows_than_the_page_holds_are_the_worst_and_it_says_so(tmp_path):

@@ -10,6 +10,8 @@ from misfit_reference import PARAMS, camera, points, refit, residuals_of
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.cameras import project
+from sfm_audit.audit.decision import misfit as decision
+from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.misfit import (
     GROUPS,
     MisfitGroup,
@@ -18,7 +20,6 @@ from sfm_audit.audit.misfit import (
     advised_camera_model,
     bic,
     image_retest,
-    named_cause,
     prepare_image,
     remaining_groups,
 )
@@ -27,6 +28,14 @@ from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
 
 G = MisfitGroup
 NOT_RUN = MisfitTest(math.nan, math.nan, None, MisfitStatus.NOT_ENOUGH_EVIDENCE)
+
+
+def named_cause(tests, candidates, num_observations, sigma_px):
+    """The cause among ``candidates``, by the decision that runs make."""
+    q = np.zeros(len(GROUPS))
+    return decision.named_cause(
+        misfit_groups(tests, q, num_observations=num_observations, sigma_px=sigma_px), candidates
+    )
 
 
 def outcomes(**px: float):

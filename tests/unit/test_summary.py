@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from run_samples import STATE, make_ref, sample_tables, settings
 
-from sfm_audit.audit.decision.verdict import ReasonCode, Verdict
+from sfm_audit.audit.table.words import Member, ReasonCode, Verdict, is_remark
 from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.store import RunStore
 from sfm_audit.reports.text.drawing import Page
-from sfm_audit.reports.text.reasons import is_remark
 from sfm_audit.reports.text.summary import CAVEATS, MAX_IMAGES_OF_ONE, MAX_MODELS, render_summary
 from sfm_audit.reports.text.wording import natural_key, number, plain, probability, px, shorten
 
@@ -206,7 +205,7 @@ def test_only_shared_cameras_with_a_material_misfit_are_listed(run_folder):
 
 @pytest.mark.parametrize("policy", ["full", "camera", "paper"])
 def test_every_verdict_is_counted_and_the_policy_named(run_folder, policy):
-    names = ("ks", "misfit", "pose", "plausible")
+    names = [member.short for member in Member]
     counts = {f"num_{v}_{m}": [10 * i + j] for i, m in enumerate(names) for j, v in enumerate(Verdict)}
     ref = make_ref()
     with RunStore(run_folder, settings(policy=policy)) as store:
@@ -214,8 +213,7 @@ def test_every_verdict_is_counted_and_the_policy_named(run_folder, policy):
         store.finish(None, [], 1.0)
     text = section(render_summary(RunReader.open(run_folder), Page(80)), "Verdicts")
     rows = {line.split()[0]: line.split()[1:4] for line in text.splitlines() if line.startswith(("verdict_", "plaus"))}
-    columns = ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible")
-    assert rows == {column: [str(10 * i), str(10 * i + 1), str(10 * i + 2)] for i, column in enumerate(columns)}
+    assert rows == {str(member): [str(10 * i), str(10 * i + 1), str(10 * i + 2)] for i, member in enumerate(Member)}
     assert f"policy {policy}" in text
 
 

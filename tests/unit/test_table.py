@@ -42,6 +42,7 @@ num_accepted_plausible num_rejected_plausible num_undetermined_plausible finding
 TEXT = {
     *("dataset", "scene", "component", "model_path", "image_name", "camera_model", "noise_model", "file_format"),
     *("verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible", "misfit_group", "advised_camera_model"),
+    *("verdict_camera", "verdict_noise", "verdict_outside", "severity"),
 }
 
 
@@ -68,6 +69,11 @@ def test_types_are_design_s(column):
         wanted = pa.list_(pa.float64())
     elif column.name == "reasons":
         wanted = pa.list_(pa.string())
+    elif column.name == "reason_details":
+        numbers, texts = ("value", "limit"), ("code", "verdict", "unit", "group", "text")
+        fields = dict.fromkeys(texts, pa.string()) | dict.fromkeys(numbers, pa.float64())
+        order = ("code", "verdict", "value", "limit", "unit", "group", "text")
+        wanted = pa.list_(pa.struct({name: fields[name] for name in order}))
     elif column.name == "findings":
         wanted = pa.list_(pa.struct({"code": pa.string(), "count": pa.int64(), "text": pa.string()}))
     else:

@@ -43,8 +43,8 @@ class CameraShape:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraFacts:
-    """One image's evidence on its camera; misfit as the model stands, expected_error_px median over the image."""
+class CameraQuality:
+    """What one image says of its camera; misfit as the model stands, expected_error_px median over the image."""
 
     shape: CameraShape
     misfit: MisfitTests
@@ -54,14 +54,15 @@ class CameraFacts:
     occupied_cells: int
 
 
-def camera_facts(
+def camera_quality(
     shape: CameraShape,
     xy_px: FloatArray,
     xyz_cam: FloatArray,
     residuals_px: FloatArray,
     sigma_px: float,
+    *,
     grid: int,
-) -> CameraFacts | None:
+) -> CameraQuality | None:
     """Ask everything that needs the Jacobian of the image's own parameters, which is built once.
 
     Parameters
@@ -71,7 +72,7 @@ def camera_facts(
 
     Returns
     -------
-    CameraFacts
+    CameraQuality
         None without inliers.
     """
     if not len(xyz_cam):
@@ -86,7 +87,7 @@ def camera_facts(
         error = expected_error_map(camera, known.parameters, sigma_px, depth, rays=shape.rays).median_px
     fields = candidate_fields(camera, projected)
     prepared = prepare(columns, fields, clusters=coincident_keypoints(xy_px), overwrite_fields=True)
-    return CameraFacts(
+    return CameraQuality(
         shape,
         prepared.test(residuals_px),
         known,

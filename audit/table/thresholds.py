@@ -1,0 +1,43 @@
+"""The numbers that decide, with their defaults: one place for the audit, its settings, its pages and its documents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """One number that decides: its default, and one line about it."""
+
+    default: float
+    meaning: str
+
+
+ALPHA: Final = Threshold(0.05, "level of the tests: an image is rejected when its p-value is below")
+MIN_EFFECT: Final = "0.2px"
+"""Default of the smallest misfit that matters (tau): in px, or in sigma of the image."""
+MIN_KS_DISTANCE: Final = Threshold(
+    0.0,
+    "verdict_ks rejects only where D is larger too; 0 is the paper's decision, which with thousands of "
+    "observations an image rejects noise that is hardly different (verdict_noise asks for a visible difference)",
+)
+MIN_OBSERVATIONS: Final = Threshold(20, "a verdict needs that many standardised observations, or it is undetermined")
+MAX_POSE_OFFSET_PX: Final = Threshold(
+    0.5, "px; images with a larger pose_offset_px are left out of the statistics of tracks"
+)
+MIN_FOCAL_OVER_SIZE: Final = Threshold(0.3, "f / max(width, height) below which a camera is implausible")
+MAX_FOCAL_OVER_SIZE: Final = Threshold(10.0, "f / max(width, height) above which a camera is implausible")
+MAX_SD_FOCAL_REL: Final = Threshold(0.01, "sd of f / f above which the focal length is not identified")
+MIN_K1_SDS: Final = Threshold(2.0, "|k1| / sd below which k1 is not identified (a remark)")
+MIN_COVERAGE: Final = Threshold(0.2, "share of the image under the inliers' hull below which nothing is said")
+MIN_OCCUPIED_CELLS: Final = Threshold(16, "occupied cells (of grid x grid) below which nothing is said")
+EXACT_SHARE: Final = 1e-9
+"""Residuals below this share of the longer side of the image are rounding, not measurement."""
+
+
+def effect_px(min_effect: str, sigma_px: float | None) -> float | None:
+    """Return tau in px of a min_effect such as 0.2px or 0.5sigma; None where sigma is asked for and not known."""
+    if min_effect.endswith("px"):
+        return float(min_effect.removesuffix("px"))
+    return None if sigma_px is None else float(min_effect.removesuffix("sigma")) * sigma_px
