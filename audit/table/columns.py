@@ -11,6 +11,7 @@ from typing import Final, Literal
 import pyarrow as pa
 
 from sfm_audit.audit.table.arrow import build_table
+from sfm_audit.loaders.formats import format_names
 
 __all__ = [
     "CALIBRATION",
@@ -210,7 +211,7 @@ _FINDING: Final = pa.struct([("code", pa.string()), ("count", pa.int64()), ("tex
 
 MODELS: Final[tuple[Column, ...]] = (
     *_IDENTITY,
-    _text("file_format", "binary or text"),
+    _text("file_format", f"format of the model's files: {', '.join(format_names())}"),
     _count("num_cameras", "cameras in the model, used or not"),
     _count("num_images", "registered images"),
     _count("num_points3d", "3D points"),

@@ -33,7 +33,7 @@ def find_track_inconsistencies(model: SparseModel, points: RawPoints) -> tuple[F
     """Return the findings about links, tracks, and the points that they share."""
     num_links = np.bincount(model.observations.point_idx + 1, minlength=len(model.points) + 1)[1:]
     checks = (
-        _tracks_disagree(model, points),
+        _tracks_disagree(model, points) if points.has_tracks else None,
         _dangling(model),
         _points_with(model, num_links == 0, FindingCode.UNSEEN_POINTS, "no image links to"),
         _points_with(model, num_links == 1, FindingCode.SHORT_TRACKS, "only one 2D point links to"),
