@@ -24,7 +24,7 @@ from sfm_audit.loaders.datasets.layouts import (
 )
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
 from sfm_audit.loaders.formats import format_names, marks_model, model_file_names
-from sfm_audit.loaders.paths.files import exists, is_folder
+from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
 
 _REQUESTS_AT_ONCE: Final = 16  # to an object store: its answers take their time, and not this machine's
@@ -150,7 +150,7 @@ def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
 
 def _check_root(root: InputPath) -> None:
     """Raise unless ``root`` is a folder; a listing says more than a question (no such bucket), so it comes first."""
-    if (isinstance(root, RemotePath) and root.listing) or is_folder(root):
+    if (isinstance(root, RemotePath) and listing_of(root)) or is_folder(root):
         return
     if exists(root.resolve() if isinstance(root, Path) else root):
         raise UnreadableFileError(str(root), None, "a folder", "a file", "name the folder that holds the model")
@@ -243,6 +243,6 @@ def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found
 
 def _listing_or_error(folder: RemotePath) -> Mapping[str, Entry] | LoadError:
     try:
-        return folder.listing
+        return listing_of(folder)
     except LoadError as error:
         return error

@@ -10,6 +10,7 @@ from stat import S_ISDIR
 from sfm_audit.loaders.datasets.fingerprint import files_in
 from sfm_audit.loaders.errors import LoadError
 from sfm_audit.loaders.formats import files_read, model_file_names
+from sfm_audit.loaders.paths.files import listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, parse_location
 
 
@@ -69,7 +70,7 @@ def model_files_in(folder: InputPath) -> dict[str, Entry]:
     """Return the files of ``folder`` that can matter to its model, in a fixed order; none where it cannot be read."""
     if isinstance(folder, RemotePath):
         try:
-            listing = folder.listing
+            listing = listing_of(folder)
         except LoadError:
             return {}  # opening the model says what is wrong
         return {name: listing[name] for name in model_file_names() if name in listing}
