@@ -1,4 +1,4 @@
-"""Reconstructions in, one columnar model out."""
+"""Reads reconstructions of any format into one columnar model."""
 
 from sfm_audit.loaders.datasets.discover import Discovery, ModelRef, discover
 from sfm_audit.loaders.datasets.fingerprint import InputFile, input_files

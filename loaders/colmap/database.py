@@ -198,7 +198,7 @@ def _check_file(path: Path) -> None:
 
 
 def _asked(path: Path, question: Callable[[], T]) -> T:
-    """Return the answer of SQLite, whose complaints (of damaged tables, in damaged letters) become a LoadError."""
+    """Return the answer of SQLite; its errors, and text that is not UTF-8, become a LoadError."""
     try:
         return question()
     except (sqlite3.Error, UnicodeDecodeError) as error:

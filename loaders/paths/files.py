@@ -1,4 +1,4 @@
-"""Opening input files: whatever keeps a file from being read becomes a LoadError here, before any format is parsed."""
+"""Opens input files; every reason why a file cannot be read becomes a LoadError here, before a format is parsed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COPY_AGAIN: Final = "copy or export the reconstruction again"
 
 
 def exists(path: InputPath) -> bool:
-    """Whether something lies at ``path``, readable or not; LoadError where an object store does not say."""
+    """Whether ``path`` exists, readable or not; LoadError where an object store does not answer."""
     if isinstance(path, Path):
         return os.path.lexists(path)
     if path.folder is not None:
@@ -50,7 +50,7 @@ def listing_of(folder: RemotePath) -> Mapping[str, Entry]:
 
 
 def is_folder(path: InputPath) -> bool:
-    """Whether a folder lies at ``path``; LoadError where an object store does not say."""
+    """Whether ``path`` is a folder; LoadError where an object store does not answer."""
     if isinstance(path, Path):
         return path.is_dir()
     from sfm_audit.loaders.paths.remote import kind_of  # noqa: PLC0415 - as above
@@ -126,7 +126,7 @@ def read_bytes(path: InputPath) -> bytes:
 
 @contextmanager
 def reading(path: InputPath) -> Iterator[None]:
-    """Turn what keeps an open file from being read, such as a disk that fails, into a LoadError."""
+    """Turn errors while reading an open file, such as a failing disk, into a LoadError."""
     try:
         yield
     except OSError as error:

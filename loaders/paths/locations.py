@@ -20,7 +20,7 @@ OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "s3": ("anonymous", "region", "endpoint_override", "scheme"),
     "gs": ("anonymous", "endpoint_override", "scheme"),
 }
-"""Kinds of object stores, and what can be said of the connection to them."""
+"""Kinds of object stores, and the options of a connection to them."""
 
 _URI: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.*)", re.DOTALL)
 _QUERY: Final = re.compile(r"(.*)\?([a-z_]+=[^&]*(?:&[a-z_]+=[^&]*)*)", re.DOTALL)
