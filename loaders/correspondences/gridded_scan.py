@@ -1,4 +1,4 @@
-"""A laser scan as the grid that the scanner walked, rows in tilt and columns in pan, and the neighbours of its points."""
+"""A laser scan as the scanner's grid, rows in tilt and columns in pan, and the neighbours of its points."""
 
 from __future__ import annotations
 

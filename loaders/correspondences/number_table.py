@@ -1,7 +1,7 @@
 """Tables of numbers by column name, CSV or Parquet, where every cell must hold a finite number.
 
-What a file states about itself (such as an image's size) stands in a CSV file as ``key=value`` in comment lines above the line
-of column names, in a Parquet file as key and value of the schema's metadata.
+What a file states about itself (such as an image's size) stands in a CSV file as ``key=value`` in comment lines above
+the line of column names, in a Parquet file as key and value of the schema's metadata.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
 
 
 def _check_root(root: InputPath) -> None:
-    """Raise unless ``root`` is a folder; the listing is asked first, as its errors are more specific (no such bucket)."""
+    """Raise unless ``root`` is a folder; the listing comes first: its errors are more specific (no such bucket)."""
     if (isinstance(root, RemotePath) and listing_of(root)) or is_folder(root):
         return
     if exists(root.resolve() if isinstance(root, Path) else root):

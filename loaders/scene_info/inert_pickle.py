@@ -1,9 +1,9 @@
 """Reads pickles from untrusted sources without running anything that they name.
 
 An allowlist of globals is not enough, because numpy's own are not safe: ``dtype.__setstate__`` accepts any flags, and
-an object array whose dtype claims to hold no objects takes its pointers from the file. So no callable of numpy is ever called
-with what the pickle says. Each allowed global is replaced by an inert stand-in that only records its arguments; arrays,
-dtypes and scalars are made from these records afterwards, by code that checks every field.
+an object array whose dtype claims to hold no objects takes its pointers from the file. So no callable of numpy is ever
+called with what the pickle says. Each allowed global is replaced by an inert stand-in that only records its arguments;
+arrays, dtypes and scalars are made from these records afterwards, by code that checks every field.
 """
 
 from __future__ import annotations
