@@ -1,6 +1,5 @@
-"""Reconstructions in, one columnar model out."""
+"""Reads reconstructions of any format into one columnar model."""
 
-from sfm_audit.loaders.colmap.folder import open_model
 from sfm_audit.loaders.datasets.discover import Discovery, ModelRef, discover
 from sfm_audit.loaders.datasets.fingerprint import InputFile, input_files
 from sfm_audit.loaders.errors import (
@@ -24,6 +23,7 @@ from sfm_audit.loaders.model import (
     PointTable,
     SparseModel,
 )
+from sfm_audit.loaders.opening import open_model
 
 __all__ = [
     "CameraRecord",

@@ -1,4 +1,6 @@
-"""COLMAP's camera models: ids as on disk, names, and the meaning of each parameter.
+"""COLMAP's camera models: ids as on disk, names, and the meaning of each parameter, one record each in one list.
+
+The mathematics of a model is its record of the same name in `audit.cameras.models`.
 
 Source: COLMAP 4.2 ``src/colmap/sensor/models.h``; checked against ``pycolmap.CameraModelId`` in the tests.
 """
@@ -11,11 +13,16 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """One of COLMAP's camera models: ``param_names`` in the order in which files store them."""
+    """One of COLMAP's camera models.
+
+    model_id, name: as in files.    param_names: in the order in which files store the parameters.
+    is_spherical: whether the camera sees directions behind it (no Zc > 0 condition, method.md section 1).
+    """
 
     model_id: int
     name: str
     param_names: tuple[str, ...]
+    is_spherical: bool = False
 
     @property
     def num_params(self) -> int:
@@ -38,14 +45,9 @@ class CameraModel:
         known = {"f", "fx", "fy", "cx", "cy", "w", "h"}
         return tuple(i for i, name in enumerate(self.param_names) if name not in known)
 
-    @property
-    def is_spherical(self) -> bool:
-        """Whether the camera sees directions behind it (no Zc > 0 condition, method.md section 1)."""
-        return self.name == "EQUIRECTANGULAR"
 
-
-def _model(model_id: int, name: str, params: str) -> CameraModel:
-    return CameraModel(model_id, name, tuple(params.split()))
+def _model(model_id: int, name: str, params: str, *, is_spherical: bool = False) -> CameraModel:
+    return CameraModel(model_id, name, tuple(params.split()), is_spherical)
 
 
 CAMERA_MODELS: Final[tuple[CameraModel, ...]] = (
@@ -66,7 +68,7 @@ CAMERA_MODELS: Final[tuple[CameraModel, ...]] = (
     _model(14, "SIMPLE_FISHEYE", "f cx cy"),
     _model(15, "FISHEYE", "fx fy cx cy"),
     _model(16, "EUCM", "fx fy cx cy alpha beta"),
-    _model(17, "EQUIRECTANGULAR", "w h"),
+    _model(17, "EQUIRECTANGULAR", "w h", is_spherical=True),
 )
 BY_ID: Final[dict[int, CameraModel]] = {model.model_id: model for model in CAMERA_MODELS}
 BY_NAME: Final[dict[str, CameraModel]] = {model.name: model for model in CAMERA_MODELS}

@@ -1,4 +1,4 @@
-"""What a loader says when an input cannot be read: which file, where, what was expected, what was found, what to do."""
+"""Errors for inputs that cannot be read: which file, where, what was expected, what was found, what to do."""
 
 from __future__ import annotations
 

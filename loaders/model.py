@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -206,10 +206,13 @@ class ObservationTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SparseModel:
-    """A reconstruction, columnar: what the images themselves say, links taken from the images' own point ids."""
+    """A reconstruction, columnar; links are those of the images' own point ids.
+
+    location: as given to `open_model`.    file_format: name of the format it was read from, see `loaders.formats`.
+    """
 
     location: str
-    file_format: Literal["binary", "text"]
+    file_format: str
     cameras: CameraTable
     images: ImageTable
     points: PointTable

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from sfm_audit.audit.engine.model import audit_model as audit_reconstruction
     from sfm_audit.audit.table import ModelLabels
     from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
-    from sfm_audit.loaders.colmap.folder import open_model
     from sfm_audit.loaders.errors import LoadError
     from sfm_audit.loaders.model import SparseModel
+    from sfm_audit.loaders.opening import open_model
 
 __all__ = [
     "AuditConfig",
@@ -54,7 +54,7 @@ _HOMES: Final = {
     "Verdict": "audit.table.words",
     "audit_inliers": "audit.engine.image",
     "audit_reconstruction": "audit.engine.model",
-    "open_model": "loaders.colmap.folder",
+    "open_model": "loaders.opening",
 }
 _RENAMED: Final = {"audit_reconstruction": "audit_model"}
 

@@ -7,6 +7,8 @@ import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 UNLINKED = 2**64 - 1
 MODEL_NAMES = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 4: "OPENCV", 17: "EQUIRECTANGULAR"}
 SENSOR_NAMES = {0: "CAMERA", 1: "IMU"}
@@ -95,6 +97,32 @@ def rig_model() -> Model:
             Frame(9, 2, back, ((0, 1, 90),)),
         ),
     )
+
+
+def noisy_model(seed: int = 0, num_images: int = 5, num_points: int = 60) -> Model:
+    """A sound model: cameras side by side before a box of points, two camera models, noise of 0.5 px."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 7.0), (num_points, 3))
+    cameras = (
+        Camera(1, 2, 640, 480, (500.0, 320.0, 240.0, 0.0)),
+        Camera(7, 4, 640, 480, (520.0, 515.0, 321.0, 239.0, 0.0, 0.0, 0.0, 0.0)),
+    )
+    images, tracks = [], {point: [] for point in range(num_points)}
+    for image in range(num_images):
+        camera, centre = cameras[image % 2], (0.3 * image - 0.6, 0.1 * (image % 2), 0.0)
+        focal, shift = (500.0, (320.0, 240.0)) if image % 2 == 0 else ((520.0, 515.0), (321.0, 239.0))
+        seen = xyz - centre
+        xy = seen[:, :2] / seen[:, 2:] * focal + shift + rng.normal(0.0, 0.5, (num_points, 2))
+        is_linked = rng.random(num_points) < 0.9
+        points2d = tuple(
+            (float(x), float(y), point + 1 if is_linked[point] else UNLINKED) for point, (x, y) in enumerate(xy)
+        )
+        for point in np.flatnonzero(is_linked).tolist():
+            tracks[point].append((image + 1, point))
+        pose = (1.0, 0.0, 0.0, 0.0, *(-value for value in centre))
+        images.append(Image(image + 1, f"{image}.jpg", points2d, pose, camera.camera_id))
+    points = (Point(k + 1, tuple(tracks[k]), tuple(map(float, xyz[k])), 0.5) for k in range(num_points))
+    return Model(cameras, tuple(images), tuple(points))
 
 
 def write_binary(folder: Path, model: Model) -> Path:

@@ -12,17 +12,15 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.cameras.columns import Want
-from sfm_audit.audit.cameras.projection import extra_params, is_fisheye, scale_and_shift
-from sfm_audit.audit.cameras.rational import RATIONAL_PLANES
-from sfm_audit.audit.cameras.warps import WARPS
+from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.cameras.projection import extra_params, scale_and_shift
+from sfm_audit.audit.cameras.warps import WarpFunction
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
-from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
 _COARSE: Final = np.geomspace(1e-3, 1e2, 36)  # undistorted radii / distorted radius of the border point
 _FINE: Final = np.arange(1, 49) / 48.0  # of the coarse radius at which something happened
 _RIGHT_ANGLE: Final = math.pi / 2.0
-_DIVISION: Final = frozenset({"SIMPLE_DIVISION", "DIVISION"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +74,8 @@ def folds_over(camera: CameraRecord) -> bool:
     (theta < 90 degrees) or of FOV, EUCM and the division models with k < 0. A division model with k > 0 ends where
     k r_d^2 = 1, where its derivative is infinite; beyond, COLMAP's way back folds, and that counts.
     """
-    model = camera.model
-    if model.is_spherical:
+    model, functions = camera.model, functions_of(camera.model)
+    if functions.distort is None:
         return False
     fx, fy, _, _ = scale_and_shift(model, camera.params)
     if fx == 0.0 or fy == 0.0 or camera.width <= 0 or camera.height <= 0:
@@ -86,16 +84,16 @@ def folds_over(camera: CameraRecord) -> bool:
     reach = np.hypot(goal[:, 0], goal[:, 1])
     goal, reach = goal[reach > 0.0], reach[reach > 0.0]
     extra = extra_params(model, camera.params)
-    if model.name in _DIVISION:
-        return bool(extra[0] * float(reach.max()) ** 2 >= 1.0)
+    if functions.folds is not None:
+        return functions.folds(extra, float(reach.max()) ** 2)
     direction = goal / reach[:, None]
     coarse = reach[:, None] * _COARSE
-    if is_fisheye(model):
+    if functions.is_fisheye:
         coarse = np.minimum(coarse, _RIGHT_ANGLE)
-    turned, arrived = _states(model, extra, direction, coarse, reach)
+    turned, arrived = _states(functions.distort, extra, direction, coarse, reach)
     ended = _first(turned | arrived, coarse)
     fine = ended[:, None] * _FINE
-    turned, arrived = _states(model, extra, direction, fine, reach)
+    turned, arrived = _states(functions.distort, extra, direction, fine, reach)
     first_turn = np.where(turned.any(axis=1), turned.argmax(axis=1), _FINE.size)
     first_arrival = np.where(arrived.any(axis=1), arrived.argmax(axis=1), _FINE.size)
     return bool((first_turn < first_arrival).any())
@@ -117,7 +115,7 @@ def _first(event: BoolArray, radius: FloatArray) -> FloatArray:
 
 
 def _states(
-    model: CameraModel, extra: list[float], direction: FloatArray, radius: FloatArray, reach: FloatArray
+    distort: WarpFunction, extra: list[float], direction: FloatArray, radius: FloatArray, reach: FloatArray
 ) -> BoolArray:
     """Return (2, d, k): where the derivative is not upright, and where the border's radius has been reached.
 
@@ -125,11 +123,7 @@ def _states(
     """
     u, v = ((radius * direction[:, axis, None]).ravel() for axis in range(2))
     with np.errstate(all="ignore"):
-        if model.name in RATIONAL_PLANES:
-            plane = RATIONAL_PLANES[model.name](u, v, np.ones_like(u), extra, Want.D_POINT)
-            x, y, (xu, xv, _, yu, yv, _) = plane.x, plane.y, plane.d_cam
-        else:
-            x, y, xu, xv, yu, yv, _ = WARPS[model.name](u, v, extra, Want.D_POINT)
+        x, y, xu, xv, yu, yv, _ = distort(u, v, extra, Want.D_POINT)
         upright = np.broadcast_to((xu * yv - xv * yu > 0.0) & (np.add(xu, yv) > 0.0), u.shape)
         arrived = (x * x + y * y).reshape(radius.shape) >= (reach * reach)[:, None]
     return np.stack([~upright.reshape(radius.shape), arrived])

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.audit.cameras.columns import Plane, Want, in_front
-from sfm_audit.audit.cameras.fisheye import angle_gain, fisheye_plane
-from sfm_audit.audit.cameras.perspective import perspective_plane
-from sfm_audit.audit.cameras.rational import RATIONAL_PLANES
-from sfm_audit.audit.cameras.spherical import spherical_plane
-from sfm_audit.audit.cameras.warps import WARPS
+from sfm_audit.audit.cameras.fisheye import angle_gain
+from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.camera_models import CameraModel
 
@@ -42,7 +39,7 @@ class ProjectionColumns:
 
 def is_fisheye(model: CameraModel) -> bool:
     """Whether ``model`` distorts the equidistant plane theta (X, Y) / rho instead of (X, Y) / Z."""
-    return model.name.endswith("FISHEYE")
+    return functions_of(model).is_fisheye
 
 
 def project(model: CameraModel, params: FloatArray, xyz_cam: FloatArray) -> FloatArray:
@@ -175,13 +172,7 @@ def _plane(model: CameraModel, params: FloatArray, xyz_cam: FloatArray, want: Wa
     """Return the points on the model's distorted normalised plane; spherical models: as shares of the image."""
     check_shapes(model, params, xyz_cam, 3)
     x, y, z = xyz_cam[:, 0], xyz_cam[:, 1], xyz_cam[:, 2]
-    if model.is_spherical:
-        return spherical_plane(x, y, z, want)
-    extra = extra_params(model, params)
-    if model.name in RATIONAL_PLANES:
-        return RATIONAL_PLANES[model.name](x, y, z, extra, want)
-    plane_of = fisheye_plane if is_fisheye(model) else perspective_plane
-    return plane_of(x, y, z, WARPS[model.name], extra, want=want)
+    return functions_of(model).plane(x, y, z, extra_params(model, params), want)
 
 
 def _finite_px(model: CameraModel, params: FloatArray, plane: Plane) -> tuple[FloatArray, IntArray | None]:

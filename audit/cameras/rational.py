@@ -6,7 +6,7 @@ With m_X, m_Y, m_Z the derivatives of m:  d(X/m)/dX = 1/m - X m_X / m^2,  d(X/m)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -81,13 +81,6 @@ def eucm_depth(r2: FloatArray, extra: Sequence[float]) -> FloatArray:
     return np.where(depth >= EPSILON, depth, np.nan)
 
 
-RATIONAL_PLANES: Final[dict[str, PlaneFunction]] = {
-    "SIMPLE_DIVISION": division_plane,
-    "DIVISION": division_plane,
-    "EUCM": eucm_plane,
-}
-RATIONAL_DEPTHS: Final[dict[str, Callable[[FloatArray, Sequence[float]], FloatArray]]] = {
-    "SIMPLE_DIVISION": division_depth,
-    "DIVISION": division_depth,
-    "EUCM": eucm_depth,
-}
+def division_folds(extra: Sequence[float], r2: float) -> bool:
+    """Whether the division models end before the squared distorted radius ``r2``: k r_d^2 = 1, k > 0."""
+    return bool(extra[0] * r2 >= 1.0)

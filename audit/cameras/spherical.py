@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,13 +11,14 @@ from sfm_audit.audit.cameras.columns import EPSILON, Plane, Want
 from sfm_audit.loaders.arrays import FloatArray
 
 
-def spherical_plane(x: FloatArray, y: FloatArray, z: FloatArray, want: Want) -> Plane:
+def spherical_plane(x: FloatArray, y: FloatArray, z: FloatArray, extra: Sequence[float], want: Want) -> Plane:
     """Return the position as a share of the image: (1/2 + longitude / 2 pi, 1/2 + latitude / pi).
 
     longitude = atan2(X, Z), latitude = atan2(Y, sqrt(X^2 + Z^2)), positive downwards. NaN only for (almost) no
     direction at all, sqrt(X^2 + Z^2) + |Y| below COLMAP's epsilon. At the two poles the derivatives are NaN: there
     the longitude has none.
     """
+    del extra
     across2 = x * x + z * z
     across = np.sqrt(across2)
     across[across + np.abs(y) < EPSILON] = np.nan
@@ -34,8 +36,9 @@ def spherical_plane(x: FloatArray, y: FloatArray, z: FloatArray, want: Want) -> 
     return Plane(share_x, share_y, d_x + d_y)
 
 
-def spherical_rays(share_x: FloatArray, share_y: FloatArray) -> FloatArray:
+def spherical_rays(share_x: FloatArray, share_y: FloatArray, extra: Sequence[float]) -> FloatArray:
     """Return (n, 3) unit rays of positions given as shares of the image; NaN outside [0, 1]."""
+    del extra
     inside = (share_x >= 0.0) & (share_x <= 1.0) & (share_y >= 0.0) & (share_y <= 1.0)
     longitude = (2.0 * math.pi) * (np.where(inside, share_x, np.nan) - 0.5)
     latitude = math.pi * (share_y - 0.5)

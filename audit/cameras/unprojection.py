@@ -1,29 +1,13 @@
-"""From pixels back to rays: in closed form where there is one, by Newton's method on the distortion elsewhere."""
+"""From pixels back to rays, for every camera model."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
-
 import numpy as np
 
-from sfm_audit.audit.cameras.columns import EPSILON, Want
-from sfm_audit.audit.cameras.projection import check_shapes, extra_params, is_fisheye, scale_and_shift
-from sfm_audit.audit.cameras.rational import RATIONAL_DEPTHS
-from sfm_audit.audit.cameras.spherical import spherical_rays
-from sfm_audit.audit.cameras.warps import WARPS, WarpFunction, radial, radial_gain
-from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.cameras.projection import check_shapes, extra_params, scale_and_shift
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
-
-MAX_ITERATIONS: Final = 100
-STEP: Final = 0.25
-"""Longest step: this share of the current radius, or this much where the radius is below 1."""
-CONVERGED: Final = 1e-9
-"""Relative step after which Newton's next one is below rounding."""
-TOLERANCE: Final = 1e-11
-"""Largest relative error of the distorted point that counts as a solution."""
-FRACTIONS: Final = np.arange(1, 17) / 16.0
-"""Where on the way from the axis to a solution the distortion must not be folded."""
 
 
 def unproject(model: CameraModel, params: FloatArray, xy_px: FloatArray) -> FloatArray:
@@ -57,80 +41,4 @@ def unproject(model: CameraModel, params: FloatArray, xy_px: FloatArray) -> Floa
     fx, fy, cx, cy = scale_and_shift(model, params)
     with np.errstate(all="ignore"):
         x, y = (xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy
-        if model.is_spherical:
-            return spherical_rays(x, y)
-        extra = extra_params(model, params)
-        if model.name in RATIONAL_DEPTHS:
-            return _unit(x, y, RATIONAL_DEPTHS[model.name](x * x + y * y, extra))
-        u, v = undistort(WARPS[model.name], extra, x, y)
-        if not is_fisheye(model):
-            return _unit(u, v, np.ones_like(u))
-        theta = np.hypot(u, v)
-        depth = np.cos(theta)
-        depth[(theta >= np.pi / 2.0) | (depth < EPSILON)] = np.nan
-        gain = np.sinc(theta / np.pi)
-        return _unit(u * gain, v * gain, depth)
-
-
-def undistort(
-    warp: WarpFunction, extra: Sequence[float], x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the (n,) undistorted u, v with warp(u, v) = (x, y); NaN where there is none or it was not found."""
-    if not extra:
-        return x.copy(), y.copy()
-    if warp is radial:
-        return _undistort_radially(extra, x, y)
-    u, v = np.zeros_like(x), np.zeros_like(y)
-    for _ in range(MAX_ITERATIONS):
-        at = warp(u, v, extra, Want.D_POINT)
-        determinant = at.xu * at.yv - at.xv * at.yu
-        dx, dy = (at.x - x) / determinant, (at.y - y) / determinant
-        du, dv = at.yv * dx - at.xv * dy, at.xu * dy - at.yu * dx
-        radius, length = np.hypot(u, v), np.hypot(du, dv)
-        reach = STEP * np.maximum(radius, 1.0)
-        shorten = reach / np.maximum(reach, length)
-        u, v = u - shorten * du, v - shorten * dv
-        if not (length > CONVERGED * (1.0 + radius)).any():
-            break
-    at = warp(u, v, extra, Want.VALUE)
-    found = np.hypot(at.x - x, at.y - y) <= TOLERANCE * (1.0 + np.hypot(x, y))
-    found &= ~_folded_on_the_way(warp, extra, u, v)
-    return np.where(found, u, np.nan), np.where(found, v, np.nan)
-
-
-def _undistort_radially(extra: Sequence[float], x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Do what `undistort` does for the warp ``radial``, whose steps all point along the radius."""
-    goal = np.hypot(x, y)
-    radius = np.zeros_like(goal)
-    for _ in range(MAX_ITERATIONS):
-        r2 = radius * radius
-        gain, slope = radial_gain(r2, extra)
-        step = (radius * gain - goal) / (gain + (2.0 * slope) * r2)
-        size, length = np.abs(radius), np.abs(step)
-        reach = STEP * np.maximum(size, 1.0)
-        radius = radius - step * (reach / np.maximum(reach, length))
-        if not (length > CONVERGED * (1.0 + size)).any():
-            break
-    gain, _ = radial_gain(radius * radius, extra)
-    found = np.abs(radius * gain - goal) <= TOLERANCE * (1.0 + goal)
-    r2_on_the_way = np.multiply.outer(FRACTIONS**2, radius * radius)
-    gain_on_the_way, slope = radial_gain(r2_on_the_way, extra)
-    determinant = gain_on_the_way * (gain_on_the_way + (2.0 * slope) * r2_on_the_way)
-    found &= determinant.min(axis=0) > 0.0
-    return np.where(found, x / gain, np.nan), np.where(found, y / gain, np.nan)
-
-
-def _folded_on_the_way(warp: WarpFunction, extra: Sequence[float], u: FloatArray, v: FloatArray) -> BoolArray:
-    """Whether the distortion turns over somewhere on the segment from the axis to (u, v), (n,)."""
-    on_the_way = np.multiply.outer(FRACTIONS, np.stack([u, v]))
-    at = warp(on_the_way[:, 0].ravel(), on_the_way[:, 1].ravel(), extra, Want.D_POINT)
-    determinant = np.asarray(at.xu * at.yv - at.xv * at.yu, dtype=np.float64)
-    smallest: FloatArray = determinant.reshape(len(FRACTIONS), -1).min(axis=0)
-    return ~(smallest > 0.0)
-
-
-def _unit(x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
-    """Return (n, 3) unit vectors, all NaN where one component is not finite."""
-    rays = np.column_stack([x, y, z])
-    length = np.sqrt((rays * rays).sum(axis=1))
-    return rays / np.where(np.isfinite(length), length, np.nan)[:, None]
+        return functions_of(model).rays(x, y, extra_params(model, params))

@@ -218,22 +218,3 @@ def _fov_general(r2: FloatArray, omega: float) -> tuple[FloatArray, FloatArray, 
         d_curvature = -8.0 * tangent**2 * d_tangent / omega - curvature / omega
         d_omega[near] = 2.0 * (d_tangent - tangent / omega) / omega + d_curvature * r2[near]
     return gain, slope, d_omega
-
-
-WARPS: Final[dict[str, WarpFunction]] = {
-    "SIMPLE_PINHOLE": identity,
-    "PINHOLE": identity,
-    "SIMPLE_RADIAL": radial,
-    "RADIAL": radial,
-    "OPENCV": opencv,
-    "FULL_OPENCV": full_opencv,
-    "FOV": fov,
-    "SIMPLE_FISHEYE": identity,
-    "FISHEYE": identity,
-    "SIMPLE_RADIAL_FISHEYE": radial,
-    "RADIAL_FISHEYE": radial,
-    "OPENCV_FISHEYE": radial,
-    "THIN_PRISM_FISHEYE": thin_prism,
-    "RAD_TAN_THIN_PRISM_FISHEYE": rad_tan_thin_prism,
-}
-"""The distortion of every model that distorts a plane; the fisheye ones distort the equidistant plane."""

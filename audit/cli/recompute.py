@@ -12,10 +12,9 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.table.thresholds import effect_px
-from sfm_audit.loaders import LoadError, MissingFileError, SparseModel, open_model
-from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
+from sfm_audit.loaders.formats import keypoint_scales_of
 from sfm_audit.reports.figures import ResidualError, Residuals
 from sfm_audit.reports.figures.residuals import principal_point, residuals_of_row
 from sfm_audit.reports.run_folder.reader import RunReader
@@ -80,7 +79,9 @@ def auditor_of(model: SparseModel, config: AuditConfig) -> ModelAuditor:
     LoadError
         There is no database, or it cannot be read.
     """
-    return ModelAuditor(model, config, _keypoint_scales(model) if config.noise == "keypoint" else None)
+    return ModelAuditor(
+        model, config, keypoint_scales_of(model, model.location) if config.noise == "keypoint" else None
+    )
 
 
 def image_residuals_of(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> Residuals:
@@ -97,14 +98,6 @@ def image_residuals_of(auditor: ModelAuditor, image_idx: int, row: Mapping[str, 
         centre_px=principal_point(row),
         sigma_px=row["sigma_constant_px"],
     )
-
-
-def _keypoint_scales(model: SparseModel) -> FloatArray:
-    database = find_database(model.location)
-    if database is None:
-        wanted, advice = "a database.db beside the model or up to three folders above it", "use --noise track"
-        raise MissingFileError(model.location, None, wanted, "none", advice)
-    return read_keypoint_shapes(database, model).scale_px
 
 
 def _location(run: RunReader, model_path: str) -> str:

@@ -9,7 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.misfit.capabilities import TERMS, Term, extended_params, larger_models, undistorted_model
+from sfm_audit.audit.cameras.functions import Term
+from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.misfit.capabilities import extended_params, larger_models, undistorted_model
 from sfm_audit.audit.misfit.multiplicity import holm
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
 from sfm_audit.audit.misfit.score import prepare_image
@@ -137,7 +139,7 @@ def _smallest_with(
     terms = {term for group in found if (term := _missing_term(model, group)) is not None}
     if not terms or (cause in _LENS and _missing_term(model, cause) is None):
         return None
-    return next((candidate for candidate in larger if TERMS[candidate.name] >= terms), None)
+    return next((candidate for candidate in larger if functions_of(candidate).terms >= terms), None)
 
 
 def _missing_term(model: CameraModel, group: MisfitGroup) -> Term | None:
@@ -152,4 +154,4 @@ def _missing_term(model: CameraModel, group: MisfitGroup) -> Term | None:
             wanted = (Term.ASPECT,)
         case _:
             pass
-    return next((term for term in wanted if term not in TERMS[model.name]), None)
+    return next((term for term in wanted if term not in functions_of(model).terms), None)

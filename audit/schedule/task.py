@@ -6,17 +6,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import pyarrow as pa
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.loaders import LoadError, MalformedFileError, MissingFileError, ModelRef, SparseModel, open_model
-from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.colmap.database import find_database, read_keypoint_shapes
+from sfm_audit.loaders import LoadError, ModelRef, open_model
 from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
+from sfm_audit.loaders.formats import keypoint_scales_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,7 @@ def audit_one(task: Task) -> Outcome:
             if state.digest == task.known_digest:
                 return Unchanged()
             model = open_model(ref.location)
-            scale_px = _keypoint_scales(ref, model) if task.config.noise == "keypoint" else None
+            scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
         except LoadError as error:
             return Failure(ref.model_path, str(error))
         labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
@@ -95,22 +93,3 @@ def died_twice(task: Task, how: str) -> Failure:
     path = task.ref.model_path
     what = f"the process that audited it died twice, the second time with no other beside it ({how})"
     return Failure(path, f"{path}: {what}; memory may be short (see dmesg), run it again where there is more")
-
-
-def _keypoint_scales(ref: ModelRef, model: SparseModel) -> FloatArray:
-    """Sizes of the model's keypoints, px, from the database.db beside or above it."""
-    database = find_database(ref.location)
-    if database is None:
-        raise MissingFileError(
-            ref.model_path,
-            None,
-            "a database.db beside the model or up to three folders above it, for --noise keypoint",
-            "none",
-            "put it there, or use --noise track",
-        )
-    scale_px = read_keypoint_shapes(database, model).scale_px
-    if scale_px.size and np.isnan(scale_px).all():
-        raise MalformedFileError(
-            str(database), None, "keypoints with a scale", "positions only", "use --noise track with these features"
-        )
-    return scale_px

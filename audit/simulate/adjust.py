@@ -16,6 +16,7 @@ from sfm_audit.audit.simulate.defects import DefectKind, perturbed_pose
 from sfm_audit.audit.simulate.scene import SimulatedScene
 from sfm_audit.audit.simulate.truth import cam_from_world, project_claimed
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.colmap.formats import BINARY
 from sfm_audit.loaders.model import (
     CameraTable,
     ImageTable,
@@ -97,7 +98,7 @@ def sparse_model(scene: SimulatedScene, claim: Claim, location: str = "simulated
     camera_id = np.arange(1, num_cameras + 1, dtype=np.uint32)
     return SparseModel(
         location=location,
-        file_format="binary",
+        file_format=BINARY.name,
         cameras=CameraTable(
             camera_id,
             np.full(num_cameras, spec.claimed_model.model_id, dtype=np.int64),

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
 from sfm_audit.audit.camera_quality.coverage import coverage
+from sfm_audit.audit.simulate.board_pose import BoardPose
 from sfm_audit.audit.simulate.lidar_scan import LidarSpec, scan
 from sfm_audit.loaders.arrays import FloatArray, UInt8Array
 from sfm_audit.loaders.correspondences.records import Correspondences
@@ -97,19 +98,6 @@ class BoardSet:
     true_xyz_world: FloatArray
     coverage: float
     extent: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardPose:
-    """Where a board stands, and where its corners are seen: rotation (3, 3), translation (3,), xy_px (n, 2)."""
-
-    rotation_cam_from_world: FloatArray
-    translation_cam_from_world: FloatArray
-    xy_px: FloatArray
-
-    def xyz_cam(self, xyz_world: FloatArray) -> FloatArray:
-        """Return points (n, 3) in the camera frame."""
-        return np.asarray(xyz_world @ self.rotation_cam_from_world.T + self.translation_cam_from_world)
 
 
 def board_sets(spec: BoardSpec, seed: int, *, rendered: bool) -> list[BoardSet]:

@@ -11,7 +11,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.special import erf, ndtr
 
 from sfm_audit.audit.calibrate.camera import CalibratedCamera
-from sfm_audit.audit.simulate.board import BoardPose
+from sfm_audit.audit.simulate.board_pose import BoardPose
 from sfm_audit.loaders.arrays import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 
 _KNOT_PX: Final = 16.0  # of the spline through the rays of pixels: exact to 1e-7

@@ -225,7 +225,7 @@ _ORDER_OF_COUNTS: Final = (  # the first four as version 0.1.0 has them
 
 MODELS: Final[tuple[Column, ...]] = (
     *_IDENTITY,
-    _text("file_format", "binary or text"),
+    _text("file_format", "format of the model's files; binary and text are COLMAP's"),
     _count("num_cameras", "cameras in the model, used or not"),
     _count("num_images", "registered images"),
     _count("num_points3d", "3D points"),

@@ -6,20 +6,19 @@ import numpy as np
 
 from sfm_audit.loaders.assembly.consistency import find_inconsistencies
 from sfm_audit.loaders.assembly.lookup import rows_of
-from sfm_audit.loaders.assembly.raw import FileFormat, RawModel
+from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.assembly.rigs import compose_poses
-from sfm_audit.loaders.model import Finding, ImageTable, ObservationTable, PointTable, SparseModel
+from sfm_audit.loaders.model import ImageTable, ObservationTable, PointTable, SparseModel
 
 
-def assemble(raw: RawModel, location: str, file_format: FileFormat, findings: tuple[Finding, ...] = ()) -> SparseModel:
+def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
     """Return the model that ``raw`` describes; links are those of the images' own point ids.
 
     Parameters
     ----------
     raw : what the files say
     location : where they lie, as the user gave it
-    file_format : which files were read
-    findings : what is already known to be wrong; those of the files and of the consistency checks follow
+    file_format : name of the format they were read from
     """
     order = raw.points.order
     points = PointTable(
@@ -43,7 +42,7 @@ def assemble(raw: RawModel, location: str, file_format: FileFormat, findings: tu
         xy_px=raw.images.xy_px,
         point_idx=rows_of(points.point3d_id, raw.images.point3d_id),
     )
-    known = findings + raw.findings + rig_findings
+    known = raw.findings + rig_findings
     model = SparseModel(location, file_format, raw.cameras, images, points, observations, known)
     return SparseModel(
         location,

@@ -11,7 +11,7 @@ import numpy as np
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
 from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.assembly.track_consistency import find_track_inconsistencies
-from sfm_audit.loaders.camera_models import CAMERA_MODELS
+from sfm_audit.loaders.camera_models import BY_ID
 from sfm_audit.loaders.model import CameraTable, Finding, FindingCode, SparseModel
 
 MAX_NORM_ERROR: Final = 1e-5
@@ -81,8 +81,10 @@ def _image_size_swapped(cameras: CameraTable) -> Finding | None:
 
 def principal_points(cameras: CameraTable) -> FloatArray:
     """Return (C, 2) principal points, px; NaN for camera models that have none."""
-    idxs = [model.principal_point_idxs or (-1, -1) for model in CAMERA_MODELS]
-    at = np.array(idxs, dtype=np.int64)[cameras.model_id].reshape(-1, 2)
+    by_id = np.full((max(BY_ID) + 1, 2), -1, dtype=np.int64)
+    for model_id, model in BY_ID.items():
+        by_id[model_id] = model.principal_point_idxs or (-1, -1)
+    at = by_id[cameras.model_id]
     with_nan = np.append(cameras.params, np.nan)
     return with_nan[np.where(at < 0, len(cameras.params), cameras.param_offsets[:-1, None] + at)]
 

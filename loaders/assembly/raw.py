@@ -1,4 +1,4 @@
-"""What the files of a COLMAP model say, before anything is put together: the same tables for binary and text.
+"""What the files of a model say, before anything is put together: the same tables for all formats.
 
 Images and cameras are sorted by id; 3D points and tracks stay in the order of the file (``order`` sorts them).
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from sfm_audit.loaders.model import CameraTable, Finding
 from sfm_audit.loaders.paths.locations import InputPath
 
 UNLINKED: Final = np.uint64(2**64 - 1)
-FileFormat = Literal["binary", "text"]
 Sensor = tuple[int, int]
 CAMERA_SENSOR: Final = 0
 IDENTITY_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -49,6 +48,7 @@ class RawPoints:
     """The points3D file in its own order; ``order`` (P,) sorts its points by id.
 
     track_lengths: (P,). track_image_id, track_point2d_idx: (T,), the tracks one after the other.
+    has_tracks: False for a format that stores no tracks: there is then nothing to compare the images' links with.
     """
 
     point3d_id: UInt64Array
@@ -58,6 +58,7 @@ class RawPoints:
     track_lengths: IntArray
     track_image_id: UInt32Array
     track_point2d_idx: UInt32Array
+    has_tracks: bool = True
 
 
 @dataclass(frozen=True, slots=True)

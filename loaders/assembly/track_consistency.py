@@ -1,4 +1,4 @@
-"""Whether the images' own point ids and the points' tracks tell the same story."""
+"""Whether the images' own point ids and the points' tracks agree."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CHUNK: Final = 1 << 18  # track elements at a time: what is needed beside the t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackDifference:
-    """Links that only one side has.
+    """Links that only the images or only the tracks have.
 
     only_in_images: (a,) rows of the observation table (links to points that do not exist left out: they are dangling).
     only_in_tracks: (b, 3) image id, POINT2D index and point id of track elements that no image confirms, each once.
@@ -33,7 +33,7 @@ def find_track_inconsistencies(model: SparseModel, points: RawPoints) -> tuple[F
     """Return the findings about links, tracks, and the points that they share."""
     num_links = np.bincount(model.observations.point_idx + 1, minlength=len(model.points) + 1)[1:]
     checks = (
-        _tracks_disagree(model, points),
+        _tracks_disagree(model, points) if points.has_tracks else None,
         _dangling(model),
         _points_with(model, num_links == 0, FindingCode.UNSEEN_POINTS, "no image links to"),
         _points_with(model, num_links == 1, FindingCode.SHORT_TRACKS, "only one 2D point links to"),

@@ -16,7 +16,13 @@ from typing import Final, TypeVar
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.errors import LoadError, MalformedFileError, TruncatedFileError, UnreadableFileError
+from sfm_audit.loaders.errors import (
+    LoadError,
+    MalformedFileError,
+    MissingFileError,
+    TruncatedFileError,
+    UnreadableFileError,
+)
 from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.paths.files import exists, open_input
 from sfm_audit.loaders.paths.locations import RemotePath, parse_location
@@ -112,6 +118,30 @@ def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes
     return KeypointShapes(str(path), scale, orientation)
 
 
+def read_keypoint_scales(model: SparseModel, shown_as: str) -> FloatArray:
+    """Return (M,) keypoint sizes, px, of a model's observations, from the database beside or above the model.
+
+    Raises
+    ------
+    LoadError
+        There is no database, it cannot be read, or it stores positions only; ``shown_as`` names the model.
+    """
+    database = find_database(model.location)
+    if database is None:
+        raise MissingFileError(
+            shown_as,
+            None,
+            "a database.db beside the model or up to three folders above it, for --noise keypoint",
+            "none",
+            "put it there, or use --noise track",
+        )
+    scale_px = read_keypoint_shapes(database, model).scale_px
+    if scale_px.size and np.isnan(scale_px).all():
+        advice = "use --noise track with these features"
+        raise MalformedFileError(str(database), None, "keypoints with a scale", "positions only", advice)
+    return scale_px
+
+
 def _shape_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scale, px, and orientation, rad, (m,) each, from the columns after x and y: none, two or four."""
     if columns.shape[1] == 0:
@@ -168,7 +198,7 @@ def _check_file(path: Path) -> None:
 
 
 def _asked(path: Path, question: Callable[[], T]) -> T:
-    """Return the answer of SQLite, whose complaints (of damaged tables, in damaged letters) become a LoadError."""
+    """Return the answer of SQLite; its errors, and text that is not UTF-8, become a LoadError."""
     try:
         return question()
     except (sqlite3.Error, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""A folder that holds a model in both formats: what the files that were not read say about the model."""
+"""A folder that holds a model in both formats: compares the files that were not read with the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A laser scan as the grid that the scanner walked, rows in tilt and columns in pan, and who is whose neighbour."""
+"""A laser scan as the scanner's grid, rows in tilt and columns in pan, and the neighbours of its points."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ScanNeighbours:
 
 
 def neighbours(scan: GriddedScan, xyz_world: FloatArray) -> ScanNeighbours:
-    """Find points (n, 3) in a scan, and what lies beside them.
+    """Find points (n, 3) in a scan, and their neighbours in pan and tilt.
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """Tables of numbers by column name, CSV or Parquet, where every cell must hold a finite number.
 
-What a file says of itself (an image's size, say) stands in a CSV file as ``key=value`` in comment lines above the line
-of column names, in a Parquet file as key and value of the schema's metadata.
+What a file states about itself (such as an image's size) stands in a CSV file as ``key=value`` in comment lines above
+the line of column names, in a Parquet file as key and value of the schema's metadata.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _PARQUET_ADVICE: Final = "write the table again"
 class NumberTable:
     """Columns (n,) by name, all of them finite; n > 0.
 
-    path: as given by the user.          facts: what the file says of itself.
+    path: as given by the user.          facts: what the file states about itself.
     lines: (n,) line number of each row, from 1; None for Parquet.
     header_line: of the column names; None for Parquet.
     """

@@ -9,7 +9,7 @@ from sfm_audit.loaders.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
-    """What is known of one image whose camera is not; row i of every array is the same correspondence.
+    """Correspondences and size of one image; row i of every array is the same correspondence.
 
     width, height: of the image, px.               xy_px: (n, 2) observed, distorted; first pixel centre = (0.5, 0.5).
     xyz_world: (n, 3) model units.                 pan_xyz_world, tilt_xyz_world: (n, 3) the next points of the scan in

@@ -89,7 +89,7 @@ def _missing(table: NumberTable, missing: list[str], advice: str) -> MalformedFi
 
 
 def _check_rows(table: NumberTable) -> None:
-    """Compare the number of rows with what the file says of itself, if it does: so a cut file is recognised."""
+    """Compare the number of rows with the number that the file states, if it does: a truncated file is recognised."""
     stated = table.facts.get("rows")
     if stated is not None and stated != str(table.num):
         advice = "copy the file again, or correct what it states"

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from sfm_audit.loaders.colmap.folder import REQUIRED, SUFFIX
-from sfm_audit.loaders.datasets.input_state import NAMES, model_files_in, size_of, stamp_of
+from sfm_audit.loaders.datasets.input_state import model_files_in, size_of, stamp_of
 from sfm_audit.loaders.datasets.layouts import (
     LAYOUTS,
     ONLY_COMPONENT,
@@ -24,10 +23,10 @@ from sfm_audit.loaders.datasets.layouts import (
     without_copies,
 )
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
-from sfm_audit.loaders.paths.files import exists, is_folder
+from sfm_audit.loaders.formats import format_names, marks_model, model_file_names
+from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
 
-_MODEL_FILES: Final = frozenset(f"{name}{suffix}" for name in REQUIRED for suffix in SUFFIX.values())
 _REQUESTS_AT_ONCE: Final = 16  # to an object store: its answers take their time, and not this machine's
 _EXAMPLES: Final = 3
 
@@ -150,8 +149,8 @@ def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
 
 
 def _check_root(root: InputPath) -> None:
-    """Raise unless ``root`` is a folder; a listing says more than a question (no such bucket), so it comes first."""
-    if (isinstance(root, RemotePath) and root.listing) or is_folder(root):
+    """Raise unless ``root`` is a folder; the listing comes first: its errors are more specific (no such bucket)."""
+    if (isinstance(root, RemotePath) and listing_of(root)) or is_folder(root):
         return
     if exists(root.resolve() if isinstance(root, Path) else root):
         raise UnreadableFileError(str(root), None, "a folder", "a file", "name the folder that holds the model")
@@ -166,7 +165,7 @@ def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef
 
 def _nothing_found(given: str, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:
     if layout is None or not left_out:
-        wanted, got = "a model folder at or below it", "no cameras, images or points3D file"
+        wanted, got = "a model folder at or below it", f"no file of a model ({', '.join(format_names())})"
         return MissingFileError(given, None, wanted, got, "name a folder that holds COLMAP models")
     examples = ", ".join(ref.model_path for ref in left_out[:_EXAMPLES])
     return MissingFileError(
@@ -211,7 +210,7 @@ def _search_local(root: Path, layout: Layout | None) -> tuple[list[_Found], list
             continue
         visited.add(real)
         parts = Path(folder).relative_to(root).parts
-        is_model = not _MODEL_FILES.isdisjoint(files) or not _MODEL_FILES.isdisjoint(folders)
+        is_model = marks_model([*files, *folders])
         if is_model:
             found.append(_Found(parts, size_of(model_files_in(Path(folder)))))
         folders[:] = folders_to_search(root_parts + parts, folders, is_model=is_model, layout=layout)
@@ -231,9 +230,9 @@ def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found
                 if isinstance(listing, LoadError):
                     errors.append(listing)
                     continue
-                is_model = not _MODEL_FILES.isdisjoint(listing)
+                is_model = marks_model(listing)
                 if is_model:
-                    files = {name: listing[name] for name in NAMES if name in listing}
+                    files = {name: listing[name] for name in model_file_names() if name in listing}
                     found.append(_Found(parts, size_of(files), stamp_of(files)))
                 folders = [name for name, entry in listing.items() if entry.is_folder]
                 folders = folders_to_search(folder.parts, folders, is_model=is_model, layout=layout)
@@ -244,6 +243,6 @@ def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found
 
 def _listing_or_error(folder: RemotePath) -> Mapping[str, Entry] | LoadError:
     try:
-        return folder.listing
+        return listing_of(folder)
     except LoadError as error:
         return error

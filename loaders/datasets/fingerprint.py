@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfm_audit.loaders.colmap.folder import files_of
+from sfm_audit.loaders.formats import files_of
 from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath, RemotePath, parse_location
 

@@ -1,15 +1,12 @@
-"""How many images has a model? Said by the first bytes of a binary one, counted in a text one; nothing is loaded."""
+"""How many images has a model? Read from the head of its files, or counted; no model is loaded."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 
-from sfm_audit.loaders.colmap.binary import num_images
-from sfm_audit.loaders.colmap.folder import file_format_of
-from sfm_audit.loaders.colmap.other_format import count_records
 from sfm_audit.loaders.errors import LoadError
-from sfm_audit.loaders.paths.files import open_input, reading
+from sfm_audit.loaders.formats import format_of
 from sfm_audit.loaders.paths.locations import parse_location
 
 _AT_ONCE = 16  # an object store takes its time to answer
@@ -24,12 +21,7 @@ def count_images(location: str) -> int:
         Files are missing, cannot be read, or are smaller than that number of images.
     """
     folder = parse_location(location)
-    if file_format_of(folder) == "text":
-        return count_records(folder / "images.txt")
-    path = folder / "images.bin"
-    file, size = open_input(path, only_head=True)
-    with file, reading(path):
-        return num_images(path, file.read(8), size)
+    return format_of(folder).count_images(folder)
 
 
 def count_images_of(locations: Iterable[str]) -> list[int | LoadError]:

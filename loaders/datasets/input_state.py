@@ -6,14 +6,12 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from stat import S_ISDIR
-from typing import Final
 
-from sfm_audit.loaders.colmap.folder import OPTIONAL, REQUIRED, SUFFIX
 from sfm_audit.loaders.datasets.fingerprint import files_in
 from sfm_audit.loaders.errors import LoadError
+from sfm_audit.loaders.formats import files_read, model_file_names
+from sfm_audit.loaders.paths.files import listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, parse_location
-
-NAMES: Final = tuple(f"{stem}{suffix}" for stem in (*REQUIRED, *OPTIONAL) for suffix in SUFFIX.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,22 +63,19 @@ def stamp_of(files: Mapping[str, Entry]) -> str:
 
 def size_of(files: Mapping[str, Entry]) -> int:
     """Return the size in bytes of the files that `loaders.open_model` would read of these."""
-    for suffix in SUFFIX.values():
-        if all(f"{stem}{suffix}" in files for stem in REQUIRED):
-            return sum(there.num_bytes for name, there in files.items() if name.endswith(suffix))
-    return sum(there.num_bytes for there in files.values())
+    return sum(there.num_bytes for there in files_read(files).values())
 
 
 def model_files_in(folder: InputPath) -> dict[str, Entry]:
     """Return the files of ``folder`` that can matter to its model, in a fixed order; none where it cannot be read."""
     if isinstance(folder, RemotePath):
         try:
-            listing = folder.listing
+            listing = listing_of(folder)
         except LoadError:
             return {}  # opening the model says what is wrong
-        return {name: listing[name] for name in NAMES if name in listing}
+        return {name: listing[name] for name in model_file_names() if name in listing}
     files = {}
-    for name in NAMES:
+    for name in model_file_names():
         try:
             stat = (folder / name).stat()
         except OSError:

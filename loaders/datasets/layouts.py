@@ -40,7 +40,7 @@ def _megadepth(parts: Parts) -> Place | None:
 
 
 def _megascenes(parts: Parts) -> Place | None:
-    """MegaScenes: a scene is two folders of three digits each; ``sparses`` is this data set's own word."""
+    """MegaScenes: a scene is two folders of three digits each; only this data set calls a folder ``sparses``."""
     if len(parts) < 3 or parts[-2] not in {"sparses", "colmap"}:
         return None
     if len(parts) >= 4 and all(len(part) == 3 and part.isdigit() for part in parts[-4:-2]):
@@ -131,7 +131,7 @@ def folders_to_search(parts: Parts, folders: list[str], *, is_model: bool, layou
 
 
 def without_copies(models: Mapping[Parts, Place], layout: Layout | None) -> dict[Parts, Place]:
-    """Return the models without D2-Net's ``sparse-txt`` where ``sparse``, the same in binary, lies beside it."""
+    """Return the models without D2-Net's ``sparse-txt`` where ``sparse``, the same model in binary, is beside it."""
     if layout not in {None, LAYOUTS["d2net"]}:
         return dict(models)
     return {

@@ -16,7 +16,7 @@ _EXAMPLES = 3
 
 @dataclass(frozen=True, slots=True)
 class SceneList:
-    """The names in a file: one per line, ``scene`` or ``scene/component``; blank lines and # comments are nothing.
+    """The names in a file: one per line, ``scene`` or ``scene/component``; blank lines and # comments are skipped.
 
     names: line numbers, from 1, by name.
     """
@@ -27,7 +27,7 @@ class SceneList:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is asked for; what is empty asks for everything. Globs know ``*``, ``?`` and ``[...]``; * crosses a /."""
+    """The models asked for; an empty field asks for all. Globs know ``*``, ``?`` and ``[...]``; * crosses a /."""
 
     scenes: tuple[str, ...] = ()
     components: tuple[str, ...] = ()

@@ -1,10 +1,10 @@
-"""Opening input files: whatever keeps a file from being read becomes a LoadError here, before any format is parsed."""
+"""Opens input files; every reason why a file cannot be read becomes a LoadError here, before a format is parsed."""
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -17,25 +17,40 @@ from sfm_audit.loaders.errors import (
     TruncatedFileError,
     UnreadableFileError,
 )
-from sfm_audit.loaders.paths.locations import InputPath, RemotePath
+from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath
 
 LFS_PREFIX: Final = b"version https://git-lfs.github.com/spec/"
 _COPY_AGAIN: Final = "copy or export the reconstruction again"
 
 
 def exists(path: InputPath) -> bool:
-    """Whether something lies at ``path``, readable or not; LoadError where an object store does not say."""
+    """Whether ``path`` exists, readable or not; LoadError where an object store does not answer."""
     if isinstance(path, Path):
         return os.path.lexists(path)
     if path.folder is not None:
-        return path.name in path.folder.listing
+        return path.name in listing_of(path.folder)
     from sfm_audit.loaders.paths.remote import kind_of  # noqa: PLC0415 - pyarrow costs what a local run need not pay
 
     return kind_of(path) is not None
 
 
+def listing_of(folder: RemotePath) -> Mapping[str, Entry]:
+    """Return what lies in a folder of an object store, by name, as of the first call for this `RemotePath`.
+
+    Raises
+    ------
+    LoadError
+        The store refuses or does not answer.
+    """
+    from sfm_audit.loaders.paths.remote import list_folder  # noqa: PLC0415 - as above
+
+    if not folder.listings:
+        folder.listings.append(list_folder(folder))
+    return folder.listings[0]
+
+
 def is_folder(path: InputPath) -> bool:
-    """Whether a folder lies at ``path``; LoadError where an object store does not say."""
+    """Whether ``path`` is a folder; LoadError where an object store does not answer."""
     if isinstance(path, Path):
         return path.is_dir()
     from sfm_audit.loaders.paths.remote import kind_of  # noqa: PLC0415 - as above
@@ -111,7 +126,7 @@ def read_bytes(path: InputPath) -> bytes:
 
 @contextmanager
 def reading(path: InputPath) -> Iterator[None]:
-    """Turn what keeps an open file from being read, such as a disk that fails, into a LoadError."""
+    """Turn errors while reading an open file, such as a failing disk, into a LoadError."""
     try:
         yield
     except OSError as error:

@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qsl, urlencode
@@ -21,7 +20,7 @@ OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "s3": ("anonymous", "region", "endpoint_override", "scheme"),
     "gs": ("anonymous", "endpoint_override", "scheme"),
 }
-"""Kinds of object stores, and what can be said of the connection to them."""
+"""Kinds of object stores, and the options of a connection to them."""
 
 _URI: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.*)", re.DOTALL)
 _QUERY: Final = re.compile(r"(.*)\?([a-z_]+=[^&]*(?:&[a-z_]+=[^&]*)*)", re.DOTALL)
@@ -37,18 +36,20 @@ class Entry:
     mtime_ns: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class RemotePath:
     """A file or folder in an object store; has of `pathlib.Path` what the loaders use of it.
 
     scheme: a key of `OPTIONS`.    parts: the bucket, then the names that lead to the file or folder.
-    options: of the connection, sorted by name.    folder: where it was reached from; its listing is asked only once.
+    options: of the connection, sorted by name.    folder: where it was reached from.
+    listings: of this folder, none or one: `files.listing_of` asks the store only once.
     """
 
     scheme: str
     parts: tuple[str, ...]
     options: tuple[tuple[str, str], ...] = ()
     folder: RemotePath | None = field(default=None, compare=False, repr=False)
+    listings: list[Mapping[str, Entry]] = field(default_factory=list, init=False, compare=False, repr=False)
 
     def __truediv__(self, name: str) -> RemotePath:
         return RemotePath(self.scheme, (*self.parts, name), self.options, self)
@@ -70,13 +71,6 @@ class RemotePath:
     def stem(self) -> str:
         """The last of the names without its suffix."""
         return Path(self.name).stem
-
-    @cached_property
-    def listing(self) -> Mapping[str, Entry]:
-        """What lies in this folder, by name, when it was first asked; LoadError where the store does not say."""
-        from sfm_audit.loaders.paths.remote import list_folder  # noqa: PLC0415 - pyarrow costs what a local run need not pay
-
-        return list_folder(self)
 
 
 InputPath = Path | RemotePath

@@ -70,7 +70,7 @@ def open_remote(path: RemotePath, piece_bytes: int = PIECE_BYTES) -> tuple[io.Bu
 
 
 def entity_tag(path: RemotePath) -> tuple[int, str | None]:
-    """Return a file's size in bytes and what the store calls this version of its content, None without such a name."""
+    """Return a file's size in bytes and the store's entity tag of its content, None without one."""
     with _asking(path), _filesystem(path).open_input_file(path.key) as file:
         metadata: dict[str, bytes] = file.metadata()  # type: ignore[assignment]
         size = file.size()
@@ -143,7 +143,7 @@ _STORES: Final[Mapping[str, Callable[[str, dict[str, Any]], pafs.FileSystem]]] =
 
 @contextmanager
 def _asking(path: RemotePath, *, is_read: bool = False) -> Iterator[None]:
-    """Turn what the store, or the way to it, objects to into a LoadError."""
+    """Turn errors of the store or of the connection into a LoadError."""
     try:
         yield
     except ImportError as error:  # pyarrow without this kind of store
@@ -155,7 +155,7 @@ def _asking(path: RemotePath, *, is_read: bool = False) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class _Complaint:
-    """What a store says, and what that means. markers: any of them in its message; the rest as of `LoadError`."""
+    """How an error of a store is reported. markers: any of them in its message; the rest as of `LoadError`."""
 
     markers: tuple[str, ...]
     kind: type[LoadError]

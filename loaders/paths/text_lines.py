@@ -1,4 +1,4 @@
-"""Text files line by line: comments, stated counts, line ends, and numbers that must be what they look like."""
+"""Text files line by line: comments, stated counts, line ends, and strict parsing of numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RECOPY: Final = "copy or export the reconstruction again"
 
 @dataclass(frozen=True, slots=True)
 class TextFile:
-    """The lines of one file; ``stated_count`` is what its comment "# Number of ...: N" says, None without one.
+    """The lines of one file; ``stated_count`` is N of its comment "# Number of ...: N", None without one.
 
     advice: what to do about a line that is not what it should be.
     """
@@ -70,7 +70,7 @@ def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
 def check_count(
     file: TextFile, kind: str, count: int, *, has_missing: Callable[[], bool], needs_line_end: bool = True
 ) -> tuple[Finding, ...]:
-    """Compare the number of records with what the file says of itself.
+    """Compare the number of records with the number that the file states.
 
     COLMAP and most other writers state the count in a comment and end every line. A file that states more records
     than it holds was cut, or its comment is wrong (public models have such comments): cut, if it holds none, or if

@@ -45,7 +45,7 @@ _FETCH: Final = "fetch the file again from a source that you trust"
 
 @dataclass(frozen=True, slots=True)
 class NpzMember:
-    """One file of a .npz as it lies there: its entry in the archive, its bytes, and how its pickle was written."""
+    """One member of a .npz: its entry in the archive, its bytes, and the protocol and package names of its pickle."""
 
     entry: zipfile.ZipInfo
     content: bytes

@@ -1,9 +1,9 @@
-"""Pickles from strangers: values come out, code does not run.
+"""Reads pickles from untrusted sources without running anything that they name.
 
-An allowlist of globals is not enough, because numpy's own are not safe: ``dtype.__setstate__`` believes any flags, and
-an object array whose dtype denies being one takes its pointers from the file. So no callable of numpy is ever called
-with what the pickle says. Each allowed global is replaced by an inert stand-in that only notes its arguments; arrays,
-dtypes and scalars are made from these notes afterwards, by code that checks every field.
+An allowlist of globals is not enough, because numpy's own are not safe: ``dtype.__setstate__`` accepts any flags, and
+an object array whose dtype claims to hold no objects takes its pointers from the file. So no callable of numpy is ever
+called with what the pickle says. Each allowed global is replaced by an inert stand-in that only records its arguments;
+arrays, dtypes and scalars are made from these records afterwards, by code that checks every field.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def load_inert(data: bytes) -> InertPickle:
 
 @dataclass(slots=True, eq=False)
 class _Note:
-    """What the pickle said: which global was called, with what, and the state it then got. Nothing was done yet."""
+    """A recorded call: the global, its arguments, and the state that was set afterwards. Nothing was executed."""
 
     call: str
     args: tuple[Any, ...]
@@ -93,7 +93,7 @@ class _Note:
 
 
 class _Global:
-    """Stands for an allowed global: calling it makes a note; it cannot be changed, subclassed or looked into."""
+    """Stand-in for an allowed global: calling it records the call; its attributes can be neither read nor set."""
 
     __slots__ = ("_name",)
     _name: str
@@ -158,14 +158,14 @@ class _Unpickler(pickle.Unpickler):
 
 
 class _Resolver:
-    """Turns notes into arrays, in containers made anew; what was one object stays one."""
+    """Makes arrays from recorded calls, in new containers; objects that the pickle shares stay shared."""
 
     def __init__(self) -> None:
         self._done: dict[int, Any] = {}
         self._open: set[int] = set()
 
     def resolve(self, value: Any, depth: int = 0) -> Any:
-        """Return ``value`` with every note in it replaced by what it stands for."""
+        """Return ``value`` with every note in it replaced by the array, dtype or scalar that it describes."""
         kind = type(value)
         if kind in _LEAVES:
             return value

@@ -19,12 +19,13 @@ import pycolmap
 from sfm_audit.loaders import SparseModel, open_model
 from sfm_audit.loaders.arrays import BoolArray
 from sfm_audit.loaders.assembly.raw import offsets_of
-from sfm_audit.loaders.colmap.folder import OPTIONAL, REQUIRED, SUFFIX
 from sfm_audit.loaders.errors import MalformedFileError
+from sfm_audit.loaders.formats import format_named, model_file_names, writer_of
 from sfm_audit.loaders.model import FindingCode, ObservationTable
+from sfm_audit.loaders.model_format import ModelWriter
 from sfm_audit.loaders.paths.files import exists
 
-MODEL_FILES: Final = frozenset(f"{name}{suffix}" for name in (*REQUIRED, *OPTIONAL) for suffix in SUFFIX.values())
+MODEL_FILES: Final = frozenset(model_file_names())
 MIN_VIEWS: Final = 2
 _CAMERA: Final = pycolmap.SensorType.CAMERA
 
@@ -56,7 +57,7 @@ def plan_pruning(model: SparseModel, removed_ids: AbstractSet[int]) -> Pruning:
 
 
 def write_pruned(model: SparseModel, pruning: Pruning, folder: Path) -> None:
-    """Write the model without what goes into the existing, empty ``folder``: the same kinds of files, by pycolmap.
+    """Write the model without what goes into the existing, empty ``folder``: in its own format, by pycolmap.
 
     What was written is read again and compared with what should have been kept.
 
@@ -67,7 +68,7 @@ def write_pruned(model: SparseModel, pruning: Pruning, folder: Path) -> None:
     Raises
     ------
     LoadError
-        The model contradicts itself, or pycolmap refuses it or reads it as another one.
+        The model contradicts itself, its format is only read, or pycolmap refuses it or reads it as another one.
     OSError
         The files cannot be written.
     """
@@ -75,35 +76,24 @@ def write_pruned(model: SparseModel, pruning: Pruning, folder: Path) -> None:
     for code in (FindingCode.TRACKS_DISAGREE, FindingCode.DANGLING_POINT_IDS):
         if code in findings:
             raise _refused(model, "a model whose images and tracks agree", findings[code])
-    reconstruction = _read(model)
+    writer = writer_of(model)
+    reconstruction = _read(model, writer)
     _remove_points(reconstruction, model, pruning)
     _remove_images(reconstruction, set(model.images.image_id[~pruning.keeps_image].tolist()))
-    if model.file_format == "binary":
-        reconstruction.write_binary(str(folder))
-    else:
-        reconstruction.write_text(str(folder))
-    suffix = SUFFIX[model.file_format]
-    if not all(exists(Path(model.location) / f"{name}{suffix}") for name in OPTIONAL):
-        for name in OPTIONAL:  # pycolmap writes what it made up for a model without
-            (folder / f"{name}{suffix}").unlink(missing_ok=True)
+    writer.write(reconstruction, folder)
+    optional = format_named(model.file_format).optional
+    if not all(exists(Path(model.location) / name) for name in optional):
+        for name in optional:  # pycolmap writes what it made up for a model without
+            (folder / name).unlink(missing_ok=True)
     _compare(model, pruning, open_model(folder))
 
 
-def _read(model: SparseModel) -> pycolmap.Reconstruction:
-    reconstruction = pycolmap.Reconstruction()
+def _read(model: SparseModel, writer: ModelWriter) -> pycolmap.Reconstruction:
     try:
-        if model.file_format == "binary":
-            reconstruction.read_binary(model.location)
-        else:
-            reconstruction.read_text(model.location)
+        return writer.read(model)
     except (ValueError, RuntimeError, IndexError) as error:
         got = f"one that pycolmap refuses ({' '.join(str(error).split())[:200]})"
         raise _refused(model, "a model that pycolmap can read", got) from error
-    if model.file_format == "text":  # COLMAP takes a name up to its first blank, this package the rest of the line
-        for image_id, name in zip(model.images.image_id.tolist(), model.images.name, strict=True):
-            if " " in name and image_id in reconstruction.images:
-                reconstruction.images[image_id].name = name
-    return reconstruction
 
 
 def _remove_points(reconstruction: pycolmap.Reconstruction, model: SparseModel, pruning: Pruning) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sfm_audit.audit.cameras.unprojection import undistort
+from sfm_audit.audit.cameras.inverse import undistort
 from sfm_audit.audit.cameras.warps import radial
 
 COEFFICIENTS = [(0.1,), (-0.2,), (-0.3, 0.05), (0.02, -0.4, 0.1), (1.5, 0.7, -0.3, 0.01), (-40.0,)]

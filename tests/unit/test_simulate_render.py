@@ -9,7 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.calibrate.camera import Distortion
-from sfm_audit.audit.simulate.board import BoardPose, BoardSpec, _place
+from sfm_audit.audit.simulate.board import BoardSpec, _place
+from sfm_audit.audit.simulate.board_pose import BoardPose
 from sfm_audit.audit.simulate.render import BoardPainter, DetectorError, PhotoSpec, detect_corners
 
 SPEC = BoardSpec()

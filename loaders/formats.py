@@ -1,0 +1,117 @@
+"""Which formats of model files can be read? The one list of them, and the questions that the list answers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import TypeVar
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.colmap.formats import BINARY, TEXT
+from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
+from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model_format import ModelFormat, ModelWriter
+from sfm_audit.loaders.paths.files import exists, is_folder
+from sfm_audit.loaders.paths.locations import InputPath
+
+FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT)
+"""Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
+
+_Value = TypeVar("_Value")
+
+
+def format_names() -> tuple[str, ...]:
+    """Return the values that the column ``file_format`` may have."""
+    return tuple(each.name for each in FORMATS)
+
+
+def model_file_names() -> tuple[str, ...]:
+    """Return the names of all files that can belong to a model, in a fixed order."""
+    return tuple(dict.fromkeys(name for each in FORMATS for name in each.files))
+
+
+def marks_model(names: Collection[str]) -> bool:
+    """Whether a folder with these names counts as a model folder: it has a file that some format requires."""
+    return any(name in names for each in FORMATS for name in each.required)
+
+
+def files_read(listing: Mapping[str, _Value]) -> dict[str, _Value]:
+    """Return the part of a folder's listing that its model is read from; of an incomplete model all of its files."""
+    found = next((each for each in FORMATS if each.matches(listing)), None)
+    names = found.files if found else model_file_names()
+    return {name: listing[name] for name in names if name in listing}
+
+
+def format_of(folder: InputPath) -> ModelFormat:
+    """Return the format of the model in ``folder``.
+
+    Raises
+    ------
+    MissingFileError
+        No format's files are complete.
+    UnreadableFileError
+        ``folder`` is a file.
+    """
+    there = [name for name in model_file_names() if exists(folder / name)]
+    found = next((each for each in FORMATS if each.matches(there)), None)
+    if found is not None:
+        return found
+    if not exists(folder):
+        raise MissingFileError(str(folder), None, "a model folder", "nothing", "check the path")
+    if not is_folder(folder):
+        raise UnreadableFileError(str(folder), None, "a model folder", "a file", "name the folder that holds the model")
+    raise _incomplete(folder, there)
+
+
+def files_of(folder: InputPath) -> tuple[InputPath, ...]:
+    """Return the files that the model in ``folder`` is read from, in a fixed order; errors as of `format_of`."""
+    paths = [folder / name for name in format_of(folder).files]
+    return tuple(path for path in paths if exists(path))
+
+
+def format_named(name: str) -> ModelFormat:
+    """Return the format with the name that a model's ``file_format`` holds; KeyError where there is none."""
+    found = next((each for each in FORMATS if each.name == name), None)
+    if found is None:
+        raise KeyError(name)
+    return found
+
+
+def writer_of(model: SparseModel) -> ModelWriter:
+    """Return what writes a model in its own format; LoadError where that format is only read."""
+    writer = format_named(model.file_format).writer
+    if writer is None:
+        writable = ", ".join(each.name for each in FORMATS if each.writer)
+        got, advice = f"one in the format {model.file_format}", "convert the model first, or use --list"
+        raise LoadError(model.location, None, f"a model in a format that can be written ({writable})", got, advice)
+    return writer
+
+
+def keypoint_scales_of(model: SparseModel, shown_as: str) -> FloatArray:
+    """Return (M,) keypoint sizes, px, of a model's observations.
+
+    Parameters
+    ----------
+    model : as `open_model` read it
+    shown_as : the model's location for messages
+
+    Raises
+    ------
+    LoadError
+        The format has none, or they cannot be read.
+    """
+    scales = format_named(model.file_format).keypoint_scales
+    if scales is None:
+        wanted, got = "a format that keeps the sizes of keypoints", f"the format {model.file_format}"
+        raise LoadError(shown_as, None, wanted, got, "use --noise track")
+    return scales(model, shown_as)
+
+
+def _incomplete(folder: InputPath, there: list[str]) -> MissingFileError:
+    """Return the error for a folder in which no format is complete; the format that lacks least is meant."""
+    meant = max(FORMATS, key=lambda each: sum(name in there for name in each.required))  # the first of equals
+    missing = [name for name in meant.required if name not in there]
+    wanted = (
+        f"{', '.join(meant.required[:-1])} and {meant.required[-1]}" if len(meant.required) > 1 else meant.required[0]
+    )
+    got = f"only {', '.join(there)}" if there else "none of them"
+    return MissingFileError(str(folder), None, wanted, got, f"add {', '.join(missing)}")

@@ -1,0 +1,68 @@
+"""What is a format of model files? The record that a reader fills in; `formats` holds the list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.assembly.raw import RawModel
+from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.paths.locations import InputPath
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, slots=True)
+class ModelWriter:
+    """How a model is written again in its own format, by way of pycolmap.
+
+    read : returns the model's files as pycolmap's reconstruction, names as in the model given
+    write : writes a reconstruction into an existing folder
+    """
+
+    read: Callable[[SparseModel], pycolmap.Reconstruction]
+    write: Callable[[pycolmap.Reconstruction, Path], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelFormat:
+    """One format of model files.
+
+    Attributes
+    ----------
+    name : str
+        What the column ``file_format`` of the tables holds.
+    required, optional : tuple of str
+        Names of the files in a model folder. A folder with one of the required files counts as a model, so that an
+        incomplete model is reported instead of passed over.
+    read : callable
+        Reads the model in a folder; raises `loaders.errors.LoadError` where that cannot be done.
+    count_images : callable
+        Returns the number of images in a folder's model without reading all of it; raises LoadError.
+    writer : ModelWriter or None
+        For `filter --model-out`; None where models of this format are only read.
+    keypoint_scales : callable or None
+        Returns (M,) sizes, px, of the keypoints of a model's observations, for ``--noise keypoint``; its second
+        argument is the model's location as messages show it. None where the format has none.
+    """
+
+    name: str
+    required: tuple[str, ...]
+    read: Callable[[InputPath], RawModel]
+    count_images: Callable[[InputPath], int]
+    optional: tuple[str, ...] = ()
+    writer: ModelWriter | None = None
+    keypoint_scales: Callable[[SparseModel, str], FloatArray] | None = None
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of all files, the required ones first."""
+        return self.required + self.optional
+
+    def matches(self, names: Collection[str]) -> bool:
+        """Whether a folder that holds these names holds a complete model of this format."""
+        return all(name in names for name in self.required)
