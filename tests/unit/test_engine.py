@@ -146,7 +146,7 @@ def test_one_image_alone_equals_constant_noise_in_its_model(model):
     auditor = ModelAuditor(model, AuditConfig(noise="constant"))
     alone, within = audit_inliers(auditor.inliers("IMG_0003.jpg")), auditor.image("IMG_0003.jpg")
     assert alone.tests == within.tests
-    assert alone.judgement == within.judgement
+    assert alone.decision.judgement == within.decision.judgement
 
 
 def test_alpha_moves_the_verdict_and_the_reason_carries_the_numbers(model):
