@@ -54,10 +54,16 @@ CAUSE_MEANINGS: Final[dict[Cause, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """A cause, and in words what was found."""
+    """A cause, in words what was found, and the numbers that exceed their limits."""
 
     cause: Cause
-    text: str
+    found: str
+    numbers: str = ""
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        return f"{self.found} ({self.numbers})" if self.numbers else self.found
 
 
 def affine_cause(fit: AffineFit, camera: CameraRecord, tolerance_px: float) -> Explanation | None:

@@ -85,7 +85,7 @@ def image_consistency(
     limit without it; elsewhere it decides nothing, and rms_px is stored_rms_px.
     """
     camera = image.camera
-    if camera is None or not np.isfinite(camera.params).all():
+    if camera is None or not np.isfinite(camera.params).all() or min(camera.width, camera.height) <= 0:
         return ImageConsistency(image.name, image.camera_id, 0, math.nan)
     with np.errstate(all="ignore"):
         points = _linked_points(image, camera, xy_px, xyz_world)
@@ -157,24 +157,19 @@ def _judged(points: _LinkedPoints, limits: ConsistencyLimits) -> ImageConsistenc
 def _exceeds(length_px: FloatArray, affine: AffineFit | None, camera: CameraRecord, limits: ConsistencyLimits) -> bool:
     """Whether the RMS of residuals is too large for parts that belong together, and not for a few wrong links alone."""
     rms_px = root_mean_square(length_px)
-    share_px = limits.max_rms_share * camera.width
-    too_large = rms_px > share_px > 0 or (
+    limit_px = limits.max_rms_share * camera.width
+    too_large = rms_px > limit_px or (
         affine is not None and rms_px > limits.min_rms_px and rms_px > limits.max_rms_ratio * affine.rest_rms_px
     )
     if not too_large:
         return False
-    num_far = int(np.count_nonzero(length_px > _tolerance_px(camera, limits)))
+    num_far = int(np.count_nonzero(length_px > limit_px))
     return num_far > limits.max_share_wrong * length_px.size or not _is_tail(median_of(length_px), rms_px)
 
 
 def _is_tail(median_px: float, rms_px: float) -> bool:
     """Whether an RMS comes from a minority of the residuals."""
     return median_px * _MIN_TAIL < rms_px
-
-
-def _tolerance_px(camera: CameraRecord, limits: ConsistencyLimits) -> float:
-    """How far a point may lie from where it should and still fit."""
-    return limits.max_rms_share * camera.width if camera.width > 0 else limits.min_rms_px
 
 
 def _half_pixel(affine: AffineFit | None, limits: ConsistencyLimits) -> int:
@@ -206,12 +201,12 @@ def _explained(known: ImageConsistency, points: _LinkedPoints, limits: Consisten
     else:
         rest = known.affine.rest_rms_px if known.affine else math.nan
         numbers = f"RMS {known.rms_px:.4g} px after the pose's own step, {rest:.3g} px after an affine map"
-    return Explanation(found.cause, f"{found.text} ({numbers})")
+    return replace(found, numbers=numbers)
 
 
 def _cause(known: ImageConsistency, points: _LinkedPoints, limits: ConsistencyLimits) -> Explanation:
     """What explains the residuals: an affine map, wrong links, another reading of the pose, or a pose that moved."""
-    affine, tolerance = known.affine, _tolerance_px(points.camera, limits)
+    affine, tolerance = known.affine, limits.max_rms_share * points.camera.width
     if affine is not None:
         typical = affine.noise_px * MEDIAN_LENGTH
         median = median_of(np.hypot(*points.residuals_px))

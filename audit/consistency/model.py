@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
-from audit.consistency.cause import CAUSE_MEANINGS, Cause
+from audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
 from audit.consistency.image import DEFAULT_LIMITS, ConsistencyLimits, ImageConsistency, image_consistency
 from loaders.arrays import BoolArray
 from loaders.model import SparseModel
@@ -41,7 +41,8 @@ class ConsistencyFinding:
 class ModelConsistency:
     """What the images say together.
 
-    images: in the order given.    inconsistent: (I,) those whose camera is rejected and that are left out of what is
+    images: in the order given; a cause that only all images together can have is taken back where they do not have it.
+    inconsistent: (I,) those whose camera is rejected and that are left out of what is
     shared; unknown counts as no.    parts_disagree: no lens of this model is to be diagnosed.
     points_behind: all observations lie behind their cameras, so that the images are undetermined.
     """
@@ -81,10 +82,11 @@ def model_consistency(
     behind: `points_behind` instead. Fewer inconsistent images: `images_disagree`, by name.
     """
     inconsistent = np.array([image.inconsistent is True for image in images], dtype=np.bool_)
+    num_judged = sum(image.inconsistent is not None for image in images)
+    images = _without_lone_scales(images, num_judged)
     num_linked = sum(image.num_linked for image in images)
     num_behind = round(sum((1.0 - image.share_in_front) * image.num_linked for image in images if image.num_linked))
     suspects = [image for image in images if image.inconsistent or image.moved]
-    num_judged = sum(image.inconsistent is not None for image in images)
     all_behind = num_linked >= limits.min_observations and num_behind == num_linked
     too_many_behind = num_linked >= limits.min_observations and num_behind > limits.max_share_wrong * num_linked
     disagree = 2 * len(suspects) >= num_judged > 0 or too_many_behind
@@ -97,6 +99,23 @@ def model_consistency(
         findings += _images_disagree([image for image in images if image.inconsistent], num_judged)
     findings += _pixel_convention(images)
     return ModelConsistency(tuple(images), tuple(findings), inconsistent, disagree or all_behind, all_behind)
+
+
+def _without_lone_scales(images: Sequence[ImageConsistency], num_judged: int) -> list[ImageConsistency]:
+    """Return the images, with a scale of the points kept as a cause only where over half of the judged images say so.
+
+    In one image another scale of the points is a pose that moved along its translation.
+    """
+    says_scale = [image.explanation is not None and image.explanation.cause is Cause.POINT_SCALE for image in images]
+    if 2 * sum(says_scale) > num_judged:
+        return list(images)
+    return [_with_pose_blamed(image) if lone else image for image, lone in zip(images, says_scale, strict=True)]
+
+
+def _with_pose_blamed(image: ImageConsistency) -> ImageConsistency:
+    cause = Cause.POSES if image.moved else Cause.POSES_OR_POINTS
+    numbers = image.explanation.numbers if image.explanation else ""
+    return replace(image, explanation=Explanation(cause, CAUSE_MEANINGS[cause], numbers))
 
 
 def _points_behind(images: Sequence[ImageConsistency], num_behind: int) -> ConsistencyFinding:
@@ -115,10 +134,10 @@ def _parts_disagree(
         words = example.text
     camera_ids = {image.camera_id for image in suspects}
     where = f"camera {next(iter(camera_ids))}: " if len(camera_ids) == 1 else ""
-    counts = f"{len(suspects)} of {num_judged} images"
-    if num_behind:
-        counts += f", {num_behind} of {num_linked} linked points behind their cameras"
-    return ConsistencyFinding(ConsistencyCode.PARTS_DISAGREE, len(suspects), f"{where}{words}; {counts}", cause)
+    counts = [f"{len(suspects)} of {num_judged} images"] if suspects else []
+    counts += [f"{num_behind} of {num_linked} linked points behind their cameras"] if num_behind else []
+    text = f"{where}{words}; {', '.join(counts)}"
+    return ConsistencyFinding(ConsistencyCode.PARTS_DISAGREE, len(suspects) or num_behind, text, cause)
 
 
 def _images_disagree(images: Sequence[ImageConsistency], num_judged: int) -> list[ConsistencyFinding]:

@@ -136,6 +136,12 @@ FAULTS = {
     ),
     "upside down": (lambda m: with_observed(m, lambda xy: [W, H] - xy), PARTS, Cause.TURNED, "by 180 degrees"),
     "opengl": (lambda m: with_poses(m, lambda r, t: (FLIP @ r, FLIP @ t)), BEHIND, Cause.CAMERA_AXES, "OpenGL"),
+    "nerf": (
+        lambda m: with_poses(m, lambda r, t: (r.T @ FLIP, -r.T @ t)),
+        BEHIND,
+        Cause.INVERTED_POSES,
+        "world_from_cam",
+    ),
     "inverted, one": (
         lambda m: with_poses(m, lambda r, t: (r.T, -r.T @ t), (5,)),
         SOME,
@@ -266,7 +272,9 @@ def test_what_cannot_be_known_is_unknown():
         single(CAMERA, xy, xyz, translation=np.full(3, np.inf)),
         single(CAMERA, xy, np.full_like(xyz, np.nan)),
         single(CAMERA, np.full_like(xy, np.inf), xyz),
+        single(dataclasses.replace(CAMERA, width=0), xy, xyz),
         single(CAMERA, xy[:19], xyz[:19]),
+        single(CAMERA, xy[:19], -xyz[:19]),
         single(CAMERA, xy[:0], xyz[:0]),
     ]
     assert [known.inconsistent for known in nothing_known] == [None] * len(nothing_known)
@@ -274,6 +282,7 @@ def test_what_cannot_be_known_is_unknown():
     assert single(CAMERA, xy[:20], xyz[:20]).inconsistent is False
     partly = np.where(np.arange(200)[:, None] < 100, xyz, np.nan)
     assert single(CAMERA, xy, partly).num_linked == 100
+    assert single(CAMERA, np.where(np.arange(200)[:, None] < 100, xy, np.nan), xyz).num_linked == 100
 
 
 @pytest.mark.parametrize("value", [1e60, 1e154, 1e300, -1e300])
@@ -285,7 +294,6 @@ def test_absurd_numbers_are_answered_without_a_warning(value):
         single(CAMERA, xy, xyz * huge),
         single(dataclasses.replace(CAMERA, params=np.array([value, 800.0, 600.0])), xy, xyz),
         single(CAMERA, xy, xyz, quat=np.array([value, 0, 0, 1.0])),
-        single(dataclasses.replace(CAMERA, width=0, height=0), xy, xyz * abs(value)),
     ):
         assert known.inconsistent in (True, False, None)
 
@@ -310,6 +318,10 @@ def test_the_rest_decides_above_twenty_pixels_in_large_images():
     assert 20 < known.rms_px < 40
     assert known.inconsistent is True
     assert known.explanation.cause is Cause.FOCAL_LENGTH
+    smaller = single(dataclasses.replace(camera, params=np.array([3000 * 1.03, 2000.0, 1500.0])), xy, xyz)
+    assert smaller.rms_px > 20 * smaller.affine.rest_rms_px
+    assert smaller.rms_px < 20
+    assert smaller.inconsistent is False
     noisy = single(camera, xy + 8 * rng.normal(size=(300, 2)), xyz)
     assert 20 < noisy.rms_px < 40
     assert noisy.inconsistent is False
@@ -318,9 +330,14 @@ def test_the_rest_decides_above_twenty_pixels_in_large_images():
 def test_a_panorama_has_no_affine_map_and_is_judged_by_its_rms():
     rng = np.random.default_rng(4)
     xyz = rng.normal(size=(300, 3))
+    xyz[:30, 0], xyz[:30, 2] = 1e-3 * xyz[:30, 0], -1.0  # at the seam
     camera = CameraRecord(1, BY_NAME["EQUIRECTANGULAR"], 2000, 1000, np.array([2000.0, 1000.0]))
     xy = project(camera.model, camera.params, xyz)
-    sound = single(camera, xy + rng.normal(size=(300, 2)), xyz)
+    noisy = xy + rng.normal(size=(300, 2))
+    noisy[:, 0] %= 2000  # some cross the seam
+    sound = single(camera, noisy, xyz)
+    assert abs(noisy - xy).max() > 1990
+    assert sound.stored_rms_px < 2
     assert sound.inconsistent is False
     assert sound.affine is None
     assert sound.share_in_front == 1.0
@@ -352,3 +369,12 @@ def test_points_on_a_line_have_no_affine_map():
     assert fit_affine(line, np.zeros((2, 50))) is None
     assert fit_affine(line[:, :3], np.zeros((2, 3))) is None
     assert fit_affine(line, np.full((2, 50), np.nan)) is None
+
+
+def test_links_to_points_that_do_not_exist_are_left_out(sound):
+    point_idx = sound.observations.point_idx.copy()
+    point_idx[::3] = -1
+    model = dataclasses.replace(sound, observations=dataclasses.replace(sound.observations, point_idx=point_idx))
+    found = consistency_of(model)
+    assert sum(image.num_linked for image in found.images) == np.count_nonzero(point_idx >= 0)
+    assert found.findings == ()
