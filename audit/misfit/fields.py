@@ -60,6 +60,10 @@ def candidate_fields(camera: CameraRecord, projected: ProjectedImage) -> FloatAr
     - rolling_shutter: pose Jacobian x (row - h / 2) / h
     - smooth: monomials of degree 1..4 of (predicted - (w, h) / 2) / (max(w, h) / 2), in x and in y
 
+    FULL_OPENCV's radial group is its own derivatives in k2 and k3 (and RAD_TAN_THIN_PRISM_FISHEYE's radial and
+    tangential ones in k1, k2 and p1, p0): a denominator or a further distortion on top bends u r^4, u r^6 away from
+    what the camera can do, and a parameter that it has would be called missing.
+
     A column that the camera's fitted parameters span already is not removed here: the test's rank finds it.
     """
     n = projected.xy_px.shape[1]

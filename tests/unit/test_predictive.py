@@ -13,6 +13,7 @@ from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.predictive import (
     StudentToNormal,
     TrackStandardiser,
+    _maximise,
     fit_track_prior,
     predict,
     student_to_normal,
@@ -77,10 +78,70 @@ def test_prior_is_the_maximum_that_a_general_optimiser_finds():
     assert_allclose(np.log([prior.nu0, prior.s0_px**2]), found.x, atol=1e-5)
 
 
+def likelihood_of(nu0, s0_px, sq, other, dof):
+    """method.md (4), written as there."""
+    nu = nu0 + dof
+    scale_sq = (nu0 * s0_px**2 + other) / nu
+    return -np.sum(np.log(scale_sq) + (nu + 2) / 2 * np.log1p(sq / (nu * scale_sq)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 49])
+def test_prior_on_the_ridge_reaches_the_maximum_of_scipy(seed):
+    """Nearly equal short tracks: gradient steps along the ridge used to end at nu0 = 87, 84, 92 for 28, 22, 35."""
+    rng = np.random.default_rng(seed)
+    variance, dof = 0.25 * np.exp(0.3 * rng.normal(size=4000)), 2 * rng.integers(3, 5, 4000) - 5
+    sq, other = variance * rng.chisquare(2, 4000), variance * rng.chisquare(dof)
+    prior = fit_track_prior(sq, other, dof)
+    best = max(
+        -optimize.minimize(
+            lambda x: -likelihood_of(*np.exp(x), sq, other, dof), [np.log(nu0), np.log(0.5)], method="Nelder-Mead"
+        ).fun
+        for nu0 in (3.0, 30.0, 300.0)
+    )
+    assert prior.converged
+    assert likelihood_of(prior.nu0, prior.s0_px, sq, other, dof) >= best - 1e-6
+
+
+@pytest.mark.parametrize("nu0", [0.1, 1e4])
+@pytest.mark.parametrize("s0_sq", [0.02, 0.25, 7.0])
+def test_a_start_on_a_bound_does_not_end_there(nu0, s0_sq):
+    e, other, dof = simulate(np.random.default_rng(11), 20_000, 5.0, 0.5)
+    sq = (e**2).sum(axis=0)
+    prior = fit_track_prior(sq, other, dof)
+    found = _maximise(np.log([nu0, s0_sq]), sq, other, dof.astype(np.float64))
+    assert found.converged
+    assert_allclose(np.exp(found.x), [prior.nu0, prior.s0_px**2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-14, 1e-3, 1e30])
+def test_prior_has_the_unit_of_the_residuals(unit):
+    e, other, dof = simulate(np.random.default_rng(12), 2000, 4.0, 0.5)
+    sq = (e**2).sum(axis=0)
+    prior, scaled = fit_track_prior(sq, other, dof), fit_track_prior(sq * unit**2, other * unit**2, dof)
+    assert scaled.nu0 == pytest.approx(prior.nu0, rel=1e-7)
+    assert scaled.s0_px == pytest.approx(prior.s0_px * unit, rel=1e-7)
+
+
+def test_a_likelihood_without_maximum_says_so():
+    """Where half of the tracks have no residuals at all, s0 = 0 is infinitely likely."""
+    e, other, dof = simulate(np.random.default_rng(13), 1000, 4.0, 0.5)
+    exact = np.arange(1000) % 2 == 0
+    prior = fit_track_prior(np.where(exact, 0.0, (e**2).sum(axis=0)), np.where(exact, 0.0, other), dof)
+    assert not prior.converged
+
+
+def test_residuals_that_overflow_have_no_prior():
+    e, other, dof = simulate(np.random.default_rng(14), 1000, 4.0, 0.5)
+    far = np.where(np.arange(1000) < 5, 1e308, (e**2).sum(axis=0))
+    assert math.isnan(fit_track_prior(far, other, dof).nu0)
+    assert math.isnan(fit_track_prior(np.where(far > 1e9, np.nan, far), other, dof).nu0)
+
+
 def test_homoscedastic_noise_puts_nu0_at_its_bound():
     e, other, dof = simulate(np.random.default_rng(7), 20_000, 1e9, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
     assert 100 < prior.nu0 <= 1e4 * (1 + 1e-12)
+    assert prior.converged
     assert prior.s0_px == pytest.approx(0.5, rel=0.01)
 
 
