@@ -49,10 +49,10 @@ observations say nothing.
 
 from __future__ import annotations
 
-from audit.consistency.affine import AffineFit, fit_affine
-from audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
-from audit.consistency.image import ConsistencyLimits, ImageConsistency, image_consistency
-from audit.consistency.model import (
+from sfm_audit.audit.consistency.affine import AffineFit, fit_affine
+from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
+from sfm_audit.audit.consistency.image import ConsistencyLimits, ImageConsistency, image_consistency
+from sfm_audit.audit.consistency.model import (
     ConsistencyCode,
     ConsistencyFinding,
     ModelConsistency,

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray
 
 MEDIAN_LENGTH: Final = math.sqrt(2.0 * math.log(2.0))  # of |eps| / sigma, eps a normal 2-vector
 _TUNING: Final = 2.385  # Cauchy weights of 95 % efficiency at the normal

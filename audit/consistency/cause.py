@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from audit.cameras.projection import scale_and_shift
-from audit.consistency.affine import AffineFit
-from loaders.arrays import FloatArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras.projection import scale_and_shift
+from sfm_audit.audit.consistency.affine import AffineFit
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import CameraRecord
 
 _MAX_FOCAL_FACTOR: Final = 1.5
 _CENTRE_TOLERANCE: Final = 0.1  # of the image size: where principal points lie around the centre

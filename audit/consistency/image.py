@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from audit.consistency.affine import MEDIAN_LENGTH, AffineFit, fit_affine, median_of, root_mean_square
-from audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation, affine_cause
-from audit.consistency.pose_step import lengths_after_pose_step, residuals_of
-from audit.consistency.readings import fitting_reading
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import CameraRecord, ImageRecord
+from sfm_audit.audit.consistency.affine import MEDIAN_LENGTH, AffineFit, fit_affine, median_of, root_mean_square
+from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation, affine_cause
+from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step, residuals_of
+from sfm_audit.audit.consistency.readings import fitting_reading
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 
 @dataclass(frozen=True, slots=True)

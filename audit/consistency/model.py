@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
-from audit.consistency.image import DEFAULT_LIMITS, ConsistencyLimits, ImageConsistency, image_consistency
-from loaders.arrays import BoolArray
-from loaders.model import SparseModel
+from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
+from sfm_audit.audit.consistency.image import DEFAULT_LIMITS, ConsistencyLimits, ImageConsistency, image_consistency
+from sfm_audit.loaders.arrays import BoolArray
+from sfm_audit.loaders.model import SparseModel
 
 _MAX_NAMES: Final = 5
 

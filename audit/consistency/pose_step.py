@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project, project_with_jacobians
-from audit.consistency.affine import median_of, robust_weights
-from audit.stationarity import pose_columns
-from loaders.arrays import FloatArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras import project, project_with_jacobians
+from sfm_audit.audit.consistency.affine import median_of, robust_weights
+from sfm_audit.audit.inliers.stationarity import pose_columns
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import CameraRecord
 
 _ROUNDS: Final = 5  # of weights; the step itself is one
 _MIN_SHARE: Final = 0.8  # of the points have to project after the step

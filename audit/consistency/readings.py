@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from audit.cameras import unproject
-from audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
-from audit.consistency.pose_step import residuals_of
-from loaders.arrays import FloatArray
-from loaders.model import CameraRecord, ImageRecord
+from sfm_audit.audit.cameras import unproject
+from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
+from sfm_audit.audit.consistency.pose_step import residuals_of
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 _MIN_SHARE: Final = 0.8  # of the points have to be in front and project
 _FLIPPED: Final = np.array([1.0, -1.0, -1.0])

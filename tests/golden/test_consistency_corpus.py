@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from corpus import parametrize_models
 
-from audit.consistency import Cause, ConsistencyCode, consistency_of
-from loaders import open_model
+from sfm_audit.audit.consistency import Cause, ConsistencyCode, consistency_of
+from sfm_audit.loaders import open_model
 
 
 @parametrize_models()

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.consistency import fit_affine, image_consistency
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord, ImageRecord
+from sfm_audit.audit.consistency import fit_affine, image_consistency
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 seeds = st.integers(0, 2**32 - 1)
 # (observed from projected, turn of the pose in rad): sound, half a pixel, moved, half size, turned, garbage

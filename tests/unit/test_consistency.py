@@ -12,12 +12,12 @@ from numpy.testing import assert_allclose
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project
-from audit.consistency import Cause, ConsistencyCode, consistency_of, fit_affine, image_consistency
-from audit.simulate.adjust import sparse_model, true_claim
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord, ImageRecord, rotation_from_quat
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.consistency import Cause, ConsistencyCode, consistency_of, fit_affine, image_consistency
+from sfm_audit.audit.simulate.adjust import sparse_model, true_claim
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, rotation_from_quat
 
 W, H = 1600, 1200
 NUM_IMAGES = 12

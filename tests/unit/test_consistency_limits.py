@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from audit.cameras import project
-from audit.consistency import (
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.consistency import (
     Cause,
     ConsistencyCode,
     Explanation,
@@ -17,11 +17,11 @@ from audit.consistency import (
     image_consistency,
     model_consistency,
 )
-from audit.consistency.affine import fit_affine, median_of
-from audit.consistency.cause import affine_cause
-from audit.consistency.pose_step import lengths_after_pose_step, residuals_of
-from loaders.camera_models import BY_NAME
-from loaders.model import CameraRecord, ImageRecord
+from sfm_audit.audit.consistency.affine import fit_affine, median_of
+from sfm_audit.audit.consistency.cause import affine_cause
+from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step, residuals_of
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 PARTS, BEHIND, SOME = ConsistencyCode.PARTS_DISAGREE, ConsistencyCode.POINTS_BEHIND, ConsistencyCode.IMAGES_DISAGREE
 CAMERA = CameraRecord(1, BY_NAME["SIMPLE_PINHOLE"], 1600, 1200, np.array([1000.0, 830.0, 570.0]))
