@@ -1,0 +1,162 @@
+"""The joint system of a model: built once, asked many times (method.md sections 11 and 11b)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+
+from audit.joint.gauge import gauge_directions
+from audit.joint.inverse import JointInverse, joint_inverse
+from audit.joint.layout import NUM_POSE
+from audit.joint.normal import ReducedSystem, nuisance_score, off_points, reduced_system, score_meat
+from audit.joint.observations import JointObservations, joint_observations
+from audit.residuals import ModelResiduals
+from loaders.arrays import BoolArray, FloatArray, IntArray
+from loaders.model import SparseModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IncludedFields:
+    """Misfit fields of one image that are free parameters of the base.
+
+    fields: (n_i, 2, r) px.    crossed: (n_i, r, 3) w E^T J.    columns: (r,) of the inverse.
+    """
+
+    image_idx: int
+    fields: FloatArray
+    crossed: FloatArray
+    columns: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """What candidates are tested against: everything that was or could be fitted.
+
+    inverse: S^+.    step: (D + m,) S^+ g.    left_px: (n, 2) y~.    included: by image.
+    """
+
+    observations: JointObservations
+    point_inverse: FloatArray
+    inverse: JointInverse
+    step: FloatArray
+    left_px: FloatArray
+    included: dict[int, IncludedFields]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSystem:
+    """The base system of a model: poses, own parameters of the cameras, points (method.md (6)).
+
+    model, residuals: what it was built from.    base: with the weights of (6).
+    reduced: S and g with these weights.    meat: (D, D) M, clustered by track.
+    plain_step: (D,) the step with w = 1: what a least-squares adjuster would take.
+    """
+
+    model: SparseModel
+    residuals: ModelResiduals
+    base: Base
+    reduced: ReducedSystem
+    meat: sparse.csr_array
+    plain_step: FloatArray
+
+    @property
+    def observations(self) -> JointObservations:
+        """The observations that take part."""
+        return self.base.observations
+
+    def image_covariance(self, image_idx: int) -> FloatArray:
+        """Return (6 + q, 6 + q): sandwich covariance S^+ M S^+ of an image's pose and own parameters.
+
+        In the order of `audit.identifiability.fitted_names`. NaN for an image without columns, and in the rows of
+        parameters that are not identified. The pose is relative to the whole model: the gauge is projected out.
+        """
+        layout = self.observations.layout
+        own = np.flatnonzero(layout.columns[image_idx] < layout.num_columns)
+        if not layout.has_columns[image_idx]:
+            return np.full((layout.width, layout.width), np.nan)
+        columns = layout.columns[image_idx, own]
+        covariance = self.covariance(columns)
+        transform = np.eye(own.size)
+        transform[:NUM_POSE, :NUM_POSE] = layout.image_from_frame[image_idx]
+        return np.asarray(transform @ covariance @ transform.T)
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Return (k, k): sandwich S^+ M S^+ at some columns; NaN where a parameter is not identified."""
+        solved = self.base.inverse.main[:, columns]
+        out = np.asarray(solved.T @ (self.meat @ solved))
+        lost = self.base.inverse.unidentified[columns]
+        out[lost] = np.nan
+        out[:, lost] = np.nan
+        return out
+
+
+def joint_system(
+    model: SparseModel,
+    residuals: ModelResiduals,
+    sigma_px: FloatArray,
+    *,
+    frame_idx: IntArray | None = None,
+    image_from_frame: FloatArray | None = None,
+    left_out: BoolArray | None = None,
+    points_independent: bool = False,
+) -> JointSystem:
+    """Build the base system of a model.
+
+    Parameters
+    ----------
+    sigma_px : (I,) sigma_constant_px, NaN where unknown
+    frame_idx, image_from_frame : (I,) and (I, 6, 6) where rigs are claimed, see `audit.joint.layout.Layout`
+    left_out : (I,) images whose observations take no part (cameras and points that do not belong together, section 12)
+    points_independent : the 3D points were not triangulated from these images: S = B
+    """
+    observations = joint_observations(
+        model,
+        residuals,
+        sigma_px,
+        left_out=left_out,
+        frame_idx=frame_idx,
+        image_from_frame=image_from_frame,
+        points_independent=points_independent,
+    )
+    gauge = gauge_directions(model, observations)
+    reduced = reduced_system(observations, observations.weight)
+    inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
+    step = inverse.main @ reduced.right
+    base = with_step(Base(observations, reduced.point_inverse, inverse, step, observations.residuals_px, {}), step)
+    meat = score_meat(observations, observations.weight, base.left_px)
+    return JointSystem(model, residuals, base, reduced, meat, _plain_step(observations, base, gauge))
+
+
+def with_step(base: Base, step: FloatArray) -> Base:
+    """Return the base with y~ = y - N step - J point_step of (7)."""
+    observations = base.observations
+    padded = np.append(step[: observations.layout.num_columns], 0.0)
+    left = observations.residuals_px.copy()
+    for image in np.flatnonzero(observations.layout.has_columns).tolist():
+        rows = observations.rows(image)
+        left[rows] -= observations.nuisance[rows] @ padded[observations.layout.columns[image]]
+    for image, extra in base.included.items():
+        left[observations.rows(image)] -= extra.fields @ step[extra.columns]
+    left = off_points(observations, observations.weight, base.point_inverse, left)
+    return replace(base, step=step, left_px=left)
+
+
+def view_scores(base: Base) -> FloatArray:
+    """Return h (n, C): w N^T y~ of every observation."""
+    return nuisance_score(base.observations, base.observations.weight, base.left_px)
+
+
+def _plain_step(observations: JointObservations, base: Base, gauge: FloatArray) -> FloatArray:
+    """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
+    plain = reduced_system(observations, observations.plain_weight)
+    if len(plain.right) <= _DIRECT:
+        return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main @ plain.right)
+    front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=lambda x: base.inverse.main @ x)
+    step, _ = sparse_linalg.cg(plain.matrix, plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
+    return np.asarray(step)
+
+
+_DIRECT = 1500
