@@ -52,16 +52,15 @@ def reduced_system(observations: JointObservations, weight: FloatArray) -> Reduc
     return ReducedSystem(inverse, blocks.matrix(), right[:-1], before[:-1])
 
 
-def score_meat(observations: JointObservations, weight: FloatArray, left_px: FloatArray) -> sparse.csr_array:
+def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr_array:
     """Return M (D, D): sum over tracks of g_t g_t^T, with g_t the score of the base system from track t.
 
     Parameters
     ----------
-    left_px : (n, 2) residuals after the step; off J, so that g_t is the sum of w N^T y~ over the track's views
+    score : (n, C) w N^T y~, with y~ the residuals after the step; they are off J, so g_t is its sum over the views
     """
     layout = observations.layout
     blocks = _Blocks(layout.num_columns)
-    score = nuisance_score(observations, weight, left_px)
     for image in np.flatnonzero(layout.has_columns).tolist():
         rows = observations.rows(image)
         if rows.start == rows.stop:

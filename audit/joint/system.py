@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +36,8 @@ class IncludedFields:
 class Base:
     """What candidates are tested against: everything that was or could be fitted.
 
-    inverse: S^+.    step: (D + m,) S^+ g.    left_px: (n, 2) y~.    included: by image.
+    inverse: S^+.    step: (D + m,) S^+ g.    left_px: (n, 2) y~.    view_scores: (n, C) h = w N^T y~.
+    included: by image.
     """
 
     observations: JointObservations
@@ -43,6 +45,7 @@ class Base:
     inverse: JointInverse
     step: FloatArray
     left_px: FloatArray
+    view_scores: FloatArray
     included: dict[int, IncludedFields]
 
 
@@ -66,6 +69,12 @@ class JointSystem:
     def observations(self) -> JointObservations:
         """The observations that take part."""
         return self.base.observations
+
+    def median_depth(self, image_idx: int) -> float:
+        """Median depth of the points that an image sees in the system, model units."""
+        points = self.residuals.point_idx[self.observations.source[self.observations.rows(image_idx)]]
+        xyz_cam = self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(points, axis=0))
+        return float(np.median(xyz_cam[:, 2])) if len(xyz_cam) else math.nan
 
     def image_covariance(self, image_idx: int) -> FloatArray:
         """Return (6 + q, 6 + q): sandwich covariance S^+ M S^+ of an image's pose and own parameters.
@@ -125,8 +134,9 @@ def joint_system(
     reduced = reduced_system(observations, observations.weight)
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main @ reduced.right
-    base = with_step(Base(observations, reduced.point_inverse, inverse, step, observations.residuals_px, {}), step)
-    meat = score_meat(observations, observations.weight, base.left_px)
+    nothing = np.zeros((0, observations.layout.width))
+    base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing[:, :2], nothing, {}), step)
+    meat = score_meat(observations, base.view_scores)
     return JointSystem(model, residuals, base, reduced, meat, _plain_step(observations, base, gauge))
 
 
@@ -141,12 +151,9 @@ def with_step(base: Base, step: FloatArray) -> Base:
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
     left = off_points(observations, observations.weight, base.point_inverse, left)
-    return replace(base, step=step, left_px=left)
-
-
-def view_scores(base: Base) -> FloatArray:
-    """Return h (n, C): w N^T y~ of every observation."""
-    return nuisance_score(base.observations, base.observations.weight, base.left_px)
+    return replace(
+        base, step=step, left_px=left, view_scores=nuisance_score(observations, observations.weight, left)
+    )
 
 
 def _plain_step(observations: JointObservations, base: Base, gauge: FloatArray) -> FloatArray:

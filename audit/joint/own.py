@@ -1,0 +1,120 @@
+"""Do the cameras' own parameters sit at their optimum, and how well are they known? (method.md section 11)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from audit.joint.layout import NUM_POSE
+from audit.joint.system import JointSystem
+from loaders.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraStep:
+    """What adjusting everything would do to one camera's own parameters.
+
+    camera_idx: row of CameraTable.    image_idxs: its images in the system.    num_observations: theirs.
+    names: (q,) own parameters.    stored, step, sd: (q,) in the units of the parameters; the implied value is stored
+    + step. sd: sandwich clustered by track, NaN where the parameter is not identified.
+    plain_step: (q,) with w = 1: what a least-squares adjuster would do. Nothing should be rejected unless both agree.
+    own_step_px: what freeing these parameters alone would gain, RMS px; plain_step_px: the same of ``plain_step``.
+    sd_focal_rel: largest sd_f / |f|, NaN where a focal length is not identified or there is none.
+    focal_identified: whether all focal lengths are.
+    """
+
+    camera_idx: int
+    image_idxs: IntArray
+    num_observations: int
+    names: tuple[str, ...]
+    stored: FloatArray
+    step: FloatArray
+    sd: FloatArray
+    plain_step: FloatArray
+    own_step_px: float
+    plain_step_px: float
+    sd_focal_rel: float
+    focal_identified: bool
+
+    @property
+    def agreed(self) -> FloatArray:
+        """(q,) the smaller of the two steps where they agree in sign, else 0."""
+        smaller = np.minimum(np.abs(self.step), np.abs(self.plain_step))
+        return np.where(self.step * self.plain_step > 0, np.copysign(smaller, self.step), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """What freeing parts of an image would gain, in units of the noise squared: pose, camera, both."""
+
+    pose: float
+    camera: float
+    both: float
+
+
+def own_parameters(system: JointSystem) -> tuple[CameraStep, ...]:
+    """Return the steps of all cameras that have images in the system.
+
+    Notes
+    -----
+    own_step_px = s sqrt(step^T [(S^+)_own]^-1 step / n) in the base system: points, poses and all other cameras
+    profiled; s the median sigma and n the observations of the camera's images.
+    """
+    layout = system.observations.layout
+    cameras = np.unique(layout.camera_idx[layout.has_columns]).tolist()
+    return tuple(_camera_step(system, camera) for camera in cameras)
+
+
+def _camera_step(system: JointSystem, camera_idx: int) -> CameraStep:
+    observations, layout = system.observations, system.observations.layout
+    camera = system.model.camera(camera_idx)
+    columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
+    images = layout.images_of_camera(camera_idx)
+    n = int(np.diff(observations.offsets)[images].sum())
+    sigma_px = float(np.median(observations.sigma_px[images]))
+    step, plain = system.base.step[columns], system.plain_step[columns]
+    sd = np.sqrt(np.maximum(system.covariance(columns).diagonal(), 0.0))
+    focal = np.array([sd[params.index(i)] / abs(camera.params[i]) for i in camera.model.focal_idxs])
+    px = [sigma_px * math.sqrt(wald(system, columns, value) / n) if n else math.nan for value in (step, plain)]
+    return CameraStep(
+        camera_idx,
+        images,
+        n,
+        tuple(camera.model.param_names[i] for i in params),
+        camera.params[params],
+        step,
+        sd,
+        plain,
+        px[0],
+        px[1],
+        float(focal.max()) if focal.size else math.nan,
+        bool(np.isfinite(focal).all()),
+    )
+
+
+def wald(system: JointSystem, columns: IntArray, step: FloatArray) -> float:
+    """Return step^T [(S^+)_bb]^-1 step at some columns b; unidentified directions gain nothing."""
+    block = system.base.inverse.main[np.ix_(columns, columns)]
+    diagonal = block.diagonal()
+    used = (diagonal > 0) & ~system.base.inverse.unidentified[columns]
+    if not used.any():
+        return 0.0
+    scale = np.sqrt(diagonal[used])
+    values, vectors = np.linalg.eigh(block[np.ix_(used, used)] / scale / scale[:, None])
+    kept = values > 1e-12
+    along = vectors[:, kept].T @ (step[used] / scale)
+    return float((along**2 / values[kept]).sum())
+
+
+def image_gains(system: JointSystem, image_idx: int) -> Gains:
+    """Return what freeing an image's pose, its camera's own parameters, or both would gain (pose or camera?)."""
+    layout = system.observations.layout
+    if not layout.has_columns[image_idx]:
+        return Gains(math.nan, math.nan, math.nan)
+    columns = layout.columns[image_idx]
+    columns = columns[columns < layout.num_columns]
+    step = system.base.step[columns]
+    pose, camera = slice(None, NUM_POSE), slice(NUM_POSE, None)
+    return Gains(*(wald(system, columns[part], step[part]) for part in (pose, camera, slice(None))))
