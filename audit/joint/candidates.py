@@ -67,7 +67,7 @@ def candidate_scores(base: Base, fields: Mapping[int, FloatArray]) -> CandidateS
             _couple_tracks(base, around, absorbed[part], coupling)
     support = np.flatnonzero((coupling[:-1] != 0).any(axis=1))
     coupling = coupling[support]
-    solution = base.inverse.block(support, support) @ coupling
+    solution = base.inverse.block(support) @ coupling
     gram -= coupling.T @ solution
     track_score = np.einsum("nac,na->nc", weighted, base.left_px[rows])
     score = track_score.sum(axis=0)

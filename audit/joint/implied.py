@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from audit.joint.candidates import CandidateScores, candidate_scores
-from audit.joint.group_test import KEPT_EIGENVALUE
 from audit.joint.observations import project_observations
 from audit.joint.own import CameraStep
 from audit.joint.system import JointSystem
@@ -24,6 +23,8 @@ from loaders.model import CameraRecord
 MAX_SD_FOCAL_REL: Final = 0.003
 MIN_SDS: Final = 5.0
 MIN_SHIFT_OVER_WIDTH: Final = 0.004
+MIN_GAIN_PX: Final = 0.1
+_ABSORBED: Final = 1e-10  # of K with unit columns; 8 px of a common principal point leave 1e-5 of their square
 _RADIAL: Final = (Term.RADIAL_2, Term.RADIAL_4, Term.RADIAL_6)
 
 
@@ -150,6 +151,8 @@ def _of_cameras(
         if parameter is Implied.PRINCIPAL_POINT:
             large &= np.abs(step) > MIN_SHIFT_OVER_WIDTH * camera.width
         px = sigma_px * math.sqrt(max(gain, 0.0) / scores.num_observations)
+        if parameter is not Implied.PRINCIPAL_POINT:
+            known = known and px > MIN_GAIN_PX
         out.append(
             ImpliedParameter(
                 parameter, camera_idx, images, names, unit, step, sd, sd_focal_rel, px, bool(known and large.any())
@@ -162,7 +165,7 @@ def _alone(scores: CandidateScores, own: slice) -> tuple[FloatArray, FloatArray,
     """Step K^+ u, its sd K^+ (sum G G^T) K^+, and the gain; NaN where base and points absorb a direction."""
     scale = 1.0 / np.sqrt(scores.sq_length[own])
     gram = scores.gram[own, own] * scale * scale[:, None]
-    if not np.isfinite(gram).all() or np.linalg.eigvalsh(gram)[0] <= KEPT_EIGENVALUE:
+    if not np.isfinite(gram).all() or np.linalg.eigvalsh(gram)[0] <= _ABSORBED:
         unknown = np.full(len(scale), np.nan)
         return unknown, unknown, math.nan
     inverse = np.linalg.inv(gram) * scale * scale[:, None]

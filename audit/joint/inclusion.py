@@ -23,7 +23,7 @@ class Candidate:
 
 
 def include(base: Base, candidates: list[Candidate]) -> Base:
-    """Return the base with the candidates' fields free, all at once; the inverse of ``base`` is used up.
+    """Return the base with the candidates' fields free, all at once.
 
     Notes
     -----
@@ -37,8 +37,8 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     for k, own in enumerate(scores):
         solution[:, starts[k] : starts[k + 1]] = base.inverse.times(own.support, own.coupling)
     schur = _joint_gram(base, candidates, scores, starts, solution)
-    inverse = _pseudo_inverse(schur)
-    theta = inverse @ np.concatenate([own.score for own in scores])
+    root = _inverse_root(schur)
+    theta = root @ (root.T @ np.concatenate([own.score for own in scores]))
     step = np.concatenate([base.step - solution @ theta, theta])
     included = dict(base.included)
     observations = base.observations
@@ -48,7 +48,7 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
         crossed = np.einsum("nar,nai->nri", weighted, observations.point_jacobian[rows])
         columns = size + np.arange(starts[k], starts[k + 1])
         included[candidate.image_idx] = IncludedFields(candidate.image_idx, candidate.fields, crossed, columns)
-    grown = replace(base, inverse=base.inverse.bordered(solution, inverse), included=included)
+    grown = replace(base, inverse=base.inverse.bordered(solution, root), included=included)
     return with_step(grown, step)
 
 
@@ -88,10 +88,9 @@ def _joint_gram(
     return 0.5 * (out + out.T)
 
 
-def _pseudo_inverse(schur: FloatArray) -> FloatArray:
-    """K^+ off eigenvalues of the unit columns below 1e-4."""
+def _inverse_root(schur: FloatArray) -> FloatArray:
+    """Root of K^+ off eigenvalues of the unit columns below 1e-4."""
     scale = 1.0 / np.sqrt(schur.diagonal())
     values, vectors = np.linalg.eigh(schur * scale * scale[:, None])
     kept = values > KEPT_EIGENVALUE
-    root = scale[:, None] * vectors[:, kept] / np.sqrt(values[kept])
-    return np.asarray(root @ root.T)
+    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))

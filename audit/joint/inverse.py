@@ -24,12 +24,14 @@ _IN_NULL: Final = 1e-6  # squared length of a parameter in null directions from 
 class JointInverse:
     """S^+ of the base system and, behind its D columns, of what was included since.
 
-    main: (D, D).    border: (D, m).    corner: (m, m).
+    main: (D, D) of the base system alone; inclusion adds update update^T to it.
+    update: (D, k).    border: (D, m).    corner: (m, m).
     unidentified: (D,) parameters without effect, or with a share in a null direction that is no gauge.
     num_null: further null directions found.
     """
 
     main: FloatArray
+    update: FloatArray
     border: FloatArray
     corner: FloatArray
     unidentified: BoolArray
@@ -40,45 +42,55 @@ class JointInverse:
         """D + m."""
         return len(self.main) + len(self.corner)
 
-    def block(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        """Return the entries at sorted rows and columns."""
+    def block(self, support: IntArray) -> FloatArray:
+        """Return the entries at some sorted rows and the same columns."""
         d = len(self.main)
-        r, c = int(np.searchsorted(rows, d)), int(np.searchsorted(columns, d))
-        out = np.empty((rows.size, columns.size))
-        out[:r, :c] = self.main[np.ix_(rows[:r], columns[:c])]
-        out[:r, c:] = self.border[np.ix_(rows[:r], columns[c:] - d)]
-        out[r:, :c] = self.border[np.ix_(columns[:c], rows[r:] - d)].T
-        out[r:, c:] = self.corner[np.ix_(rows[r:] - d, columns[c:] - d)]
+        base, extra = self._split(support)
+        k = base.size
+        out = np.empty((support.size, support.size))
+        if k == d:
+            out[:k, :k] = self.main
+        else:
+            np.take(self.main[base], base, axis=1, out=out[:k, :k], mode="clip")
+        update = self.update[base]
+        out[:k, :k] += update @ update.T
+        out[:k, k:] = self.border[np.ix_(base, extra)]
+        out[k:, :k] = out[:k, k:].T
+        out[k:, k:] = self.corner[np.ix_(extra, extra)]
         return out
 
-    def times(self, rows: IntArray, right: FloatArray) -> FloatArray:
-        """Return S^+ (all, rows) @ right, (D + m, c), of sorted rows and right (rows, c)."""
+    def _split(self, support: IntArray) -> tuple[IntArray, IntArray]:
         d = len(self.main)
-        r = int(np.searchsorted(rows, d))
-        base, extra = rows[:r], rows[r:] - d
-        whole = base.size == d
-        head = (self.main if whole else self.main[:, base]) @ right[:r] + self.border[:, extra] @ right[r:]
-        tail = self.border[base].T @ right[:r] + self.corner[:, extra] @ right[r:]
-        return np.vstack([head, tail])
+        k = int(np.searchsorted(support, d))
+        return support[:k], support[k:] - d
 
-    def bordered(self, solution: FloatArray, schur_inverse: FloatArray) -> JointInverse:
-        """Return the inverse with k columns more; ``self`` is used up, its main block is overwritten.
+    def times(self, support: IntArray, right: FloatArray) -> FloatArray:
+        """Return S^+ (all rows, at some sorted columns) @ right: (D + m, c) of (s, c)."""
+        base, extra = self._split(support)
+        head, tail = right[: base.size], right[base.size :]
+        main = self.main if base.size == len(self.main) else self.main[:, base]
+        above = main @ head + self.update @ (self.update[base].T @ head) + self.border[:, extra] @ tail
+        below = self.border[base].T @ head + self.corner[:, extra] @ tail
+        return np.vstack([above, below])
+
+    def bordered(self, solution: FloatArray, schur_root: FloatArray) -> JointInverse:
+        """Return the inverse with n columns more.
 
         Parameters
         ----------
-        solution : (D + m, k) B = S^+ R of the new columns        schur_inverse : (k, k) K^+
+        solution : (D + m, n) B = S^+ R of the new columns        schur_root : (n, r), K^+ = root root^T
 
         Notes
         -----
         [[S^+ + B K^+ B^T, -B K^+], [-K^+ B^T, K^+]].
         """
         d = len(self.main)
-        head, tail = solution[:d], solution[d:]
-        scaled_head, scaled_tail = head @ schur_inverse, tail @ schur_inverse
-        np.add(self.main, scaled_head @ head.T, out=self.main)
-        border = np.hstack([self.border + scaled_head @ tail.T, -scaled_head])
-        corner = np.block([[self.corner + scaled_tail @ tail.T, -scaled_tail], [-scaled_tail.T, schur_inverse]])
-        return replace(self, border=border, corner=corner)
+        moved = solution @ schur_root
+        head, tail = moved[:d], moved[d:]
+        border = np.hstack([self.border + head @ tail.T, -head @ schur_root.T])
+        cross = -tail @ schur_root.T
+        corner = np.block([[self.corner + tail @ tail.T, cross], [cross.T, schur_root @ schur_root.T]])
+        return replace(self, update=np.hstack([self.update, head]), border=border, corner=corner)
 
 
 def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArray) -> JointInverse:
@@ -112,7 +124,8 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     _finish(inverse, deflated, scale, dead)
     lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
     size = len(scale)
-    return JointInverse(inverse, np.zeros((size, 0)), np.zeros((0, 0)), lost, further.shape[1])
+    nothing = np.zeros((size, 0))
+    return JointInverse(inverse, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
