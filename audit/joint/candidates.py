@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
-from audit.joint.normal import nuisance_score
 from audit.joint.system import Base, IncludedFields
 from loaders.arrays import FloatArray, IntArray
 
@@ -55,11 +54,11 @@ def candidate_scores(base: Base, fields: Mapping[int, FloatArray]) -> CandidateS
     gram = weighted.reshape(-1, count).T @ own.reshape(-1, count)
     sq_length = gram.diagonal().copy()
     points, track = np.unique(observations.point_idx[rows], return_inverse=True)
-    crossed = np.einsum("nac,nai->nic", weighted, observations.point_jacobian[rows])
-    crossed = sum_by_track(crossed, track, points.size)  # J^T E
+    jacobian = np.concatenate([observations.jacobian(image) for image in images])
+    crossed = sum_by_track(jacobian.transpose(0, 2, 1) @ weighted, track, points.size)  # J^T E
     absorbed = base.point_inverse[points] @ crossed
     gram -= crossed.reshape(-1, count).T @ absorbed.reshape(-1, count)
-    coupling = _own_coupling(base, images, rows, weighted)
+    coupling = _own_coupling(base, images, weighted)
     chunks = [neighbourhood(observations, points[part]) for part in point_chunks(observations, points)]
     parts = list(point_chunks(observations, points))
     if not observations.points_independent:
@@ -81,7 +80,7 @@ def candidate_scores(base: Base, fields: Mapping[int, FloatArray]) -> CandidateS
     )
 
 
-def _own_coupling(base: Base, images: list[int], rows: IntArray, weighted: FloatArray) -> FloatArray:
+def _own_coupling(base: Base, images: list[int], weighted: FloatArray) -> FloatArray:
     """N^T E (D + m + 1, c), included fields among N; the last row is padding."""
     observations = base.observations
     layout = observations.layout
@@ -90,7 +89,7 @@ def _own_coupling(base: Base, images: list[int], rows: IntArray, weighted: Float
     start = 0
     for image in images:
         stop = start + observations.num_of(image)
-        own = observations.nuisance[rows[start:stop]].reshape(-1, layout.width)
+        own = observations.nuisance(image).reshape(-1, layout.width)
         part = weighted[start:stop].reshape(own.shape[0], -1)
         np.add.at(out, columns[image], own.T @ part)
         extra = base.included.get(image)
@@ -107,8 +106,7 @@ def _padded(base: Base, columns: IntArray) -> IntArray:
 
 def _couple_tracks(base: Base, around: Neighbourhood, absorbed: FloatArray, coupling: FloatArray) -> None:
     """Subtract W V^-1 J^T E in place."""
-    per_view = around.point_nuisance(base.observations.weight)
-    shared = around.gather(per_view, absorbed)
+    shared = around.gather(base.observations.crossed[around.views], absorbed)
     np.subtract.at(coupling, _padded(base, base.observations.layout.columns[around.images]), shared)
     for extra, own, within in _included_near(base, around):
         seen = absorbed[around.track[own]].reshape(-1, absorbed.shape[2])
@@ -119,7 +117,7 @@ def _base_scores(base: Base, around: Neighbourhood, everywhere: FloatArray) -> F
     """(T, c) sum over the views of each track of B_k^T h_k; ``everywhere`` (D + m + 1, c) is B, its last row zero."""
     observations = base.observations
     columns = _padded(base, observations.layout.columns[around.images])
-    out = around.scatter(base.view_scores[around.views], everywhere[columns])
+    out = around.scatter(base.view_scores[around.by_track], everywhere[columns])
     for extra, own, within in _included_near(base, around):
         views = around.views[own]
         left = base.left_px[views] * observations.weight[views, None]

@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from audit.joint.candidates import CandidateScores, candidate_scores
-from audit.joint.observations import project_observations
 from audit.joint.own import CameraStep
 from audit.joint.system import JointSystem
 from audit.misfit.capabilities import TERMS, Term
@@ -98,7 +97,7 @@ def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> li
 
 def _missing_fields(system: JointSystem, image: int) -> FloatArray:
     """(n_i, 2, 6) px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
-    camera, projected = project_observations(system.model, system.residuals, system.observations, image)
+    camera, projected = system.observations.project(image)
     fields = candidate_fields(camera, projected)
     out = np.zeros((6, *fields.shape[1:]))
     out[0, 0], out[1, 1] = 1.0, 1.0

@@ -45,7 +45,7 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     for k, candidate in enumerate(candidates):
         rows = observations.rows(candidate.image_idx)
         weighted = candidate.fields * observations.weight[rows, None, None]
-        crossed = np.einsum("nar,nai->nri", weighted, observations.point_jacobian[rows])
+        crossed = weighted.transpose(0, 2, 1) @ observations.jacobian(candidate.image_idx)
         columns = size + np.arange(starts[k], starts[k + 1])
         included[candidate.image_idx] = IncludedFields(candidate.image_idx, candidate.fields, crossed, columns)
     grown = replace(base, inverse=base.inverse.bordered(solution, root), included=included)
@@ -69,7 +69,7 @@ def _joint_gram(
         coupled[own.support, columns] = own.coupling
         rows = observations.rows(candidate.image_idx)
         weighted = candidate.fields * observations.weight[rows, None, None]
-        crossed = np.einsum("nar,nai->nir", weighted, observations.point_jacobian[rows])
+        crossed = observations.jacobian(candidate.image_idx).transpose(0, 2, 1) @ weighted
         shape = (3 * observations.num_points, columns.stop - columns.start)
         row = 3 * observations.point_idx[rows][:, None, None] + np.arange(3)[:, None] + np.zeros(shape[1], dtype=int)
         column = np.broadcast_to(np.arange(shape[1]), crossed.shape)

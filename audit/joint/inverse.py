@@ -48,10 +48,7 @@ class JointInverse:
         base, extra = self._split(support)
         k = base.size
         out = np.empty((support.size, support.size))
-        if k == d:
-            out[:k, :k] = self.main
-        else:
-            np.take(self.main[base], base, axis=1, out=out[:k, :k], mode="clip")
+        out[:k, :k] = self.main if k == d else self.main[np.ix_(base, base)]
         update = self.update[base]
         out[:k, :k] += update @ update.T
         out[:k, k:] = self.border[np.ix_(base, extra)]
@@ -68,7 +65,7 @@ class JointInverse:
         """Return S^+ (all rows, at some sorted columns) @ right: (D + m, c) of (s, c)."""
         base, extra = self._split(support)
         head, tail = right[: base.size], right[base.size :]
-        main = self.main if base.size == len(self.main) else self.main[:, base]
+        main = self.main if base.size == len(self.main) else self.main[base].T
         above = main @ head + self.update @ (self.update[base].T @ head) + self.border[:, extra] @ tail
         below = self.border[base].T @ head + self.corner[:, extra] @ tail
         return np.vstack([above, below])
@@ -125,7 +122,7 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
     size = len(scale)
     nothing = np.zeros((size, 0))
-    return JointInverse(inverse, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
+    return JointInverse(inverse.T, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

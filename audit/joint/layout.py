@@ -24,7 +24,7 @@ class Layout:
     camera_idx: (I,) rows of CameraTable, -1 where an image has no columns.
     own_param_idxs: per camera, which of its parameters are unknowns: all but the principal point.
     columns: (I, 6 + Q) of each image, the pose first; ``num_columns`` where a camera has fewer than Q own parameters.
-    own_columns: (C + 1,) first own column of each camera.
+    own_columns: (C + 1,) first own column of each camera.    has_rigs: whether image_from_frame says anything.
     """
 
     frame_idx: IntArray
@@ -33,6 +33,7 @@ class Layout:
     own_param_idxs: tuple[tuple[int, ...], ...]
     columns: IntArray
     own_columns: IntArray
+    has_rigs: bool
 
     @property
     def num_columns(self) -> int:
@@ -95,7 +96,7 @@ def make_layout(
     wanted = own_columns[camera_idx[used], None] + offset
     columns[used, NUM_POSE:] = np.where(offset < counts[camera_idx[used], None], wanted, num_columns)
     transforms = np.tile(np.eye(NUM_POSE), (num_images, 1, 1)) if image_from_frame is None else image_from_frame
-    return Layout(frame, transforms, camera_idx, tuple(own), columns, own_columns)
+    return Layout(frame, transforms, camera_idx, tuple(own), columns, own_columns, image_from_frame is not None)
 
 
 def image_from_frame(rotation_sensor_from_rig: FloatArray, translation_sensor_from_rig: FloatArray) -> FloatArray:

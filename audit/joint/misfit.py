@@ -12,7 +12,6 @@ import numpy as np
 from audit.joint.candidates import CandidateScores, candidate_scores
 from audit.joint.group_test import GroupTest, JointStatus, group_root, test_group, untested
 from audit.joint.inclusion import Candidate, include
-from audit.joint.observations import project_observations
 from audit.joint.system import Base, JointSystem
 from audit.joint.worth import NO_WORTH, Worth, worth_of
 from audit.misfit.fields import GROUP_COLUMNS, GROUPS, MisfitGroup, candidate_fields
@@ -200,7 +199,7 @@ class _Rounds:
 
 def _fields_of(system: JointSystem, image: int) -> FloatArray:
     """(n_i, 2, 42) candidate fields of an image, px per unit; (n_i, 2, 0) of panoramas."""
-    camera, projected = project_observations(system.model, system.residuals, system.observations, image)
+    camera, projected = system.observations.project(image)
     return np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
 
 

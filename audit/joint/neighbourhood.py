@@ -17,18 +17,22 @@ _VIEWS_AT_ONCE: Final = 200_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """All views of some points (T,), by image.
+    """All views of some points (T,), by image and by track.
 
-    points: (T,).      views: (v,) rows of the observations, by image.    track: (v,) which of the points each shows.
-    images: (m,) who sees any of them.    starts: (m + 1,) views of image k are starts[k]:starts[k + 1].
+    points: (T,).      images: (m,) who sees any of them.    starts: (m + 1,) views of image k: starts[k]:starts[k + 1].
+    views: (v,) rows of the observations, by image.    track: (v,) which of the points each shows.
+    by_track: (v,) the same rows by track.    image_of: (v,) of these, which of the images.
+    ends: (T + 1,) views of track t are by_track[ends[t]:ends[t + 1]].
     """
 
-    observations: JointObservations
     points: IntArray
-    views: IntArray
-    track: IntArray
     images: IntArray
     starts: IntArray
+    views: IntArray
+    track: IntArray
+    by_track: IntArray
+    image_of: IntArray
+    ends: IntArray
 
     def segments(self) -> Iterator[tuple[int, slice]]:
         """Each image with its views."""
@@ -36,29 +40,19 @@ class Neighbourhood:
         for k, image in enumerate(self.images.tolist()):
             yield image, slice(bounds[k], bounds[k + 1])
 
-    def point_nuisance(self, weight: FloatArray) -> FloatArray:
-        """Return (v, 3, C): W^T = w J^T N of every view."""
-        rows = self.views
-        jacobian = self.observations.point_jacobian[rows] * weight[rows, None, None]
-        nuisance = self.observations.nuisance[rows]
-        out = jacobian[:, 0, :, None] * nuisance[:, 0, None, :]
-        out += jacobian[:, 1, :, None] * nuisance[:, 1, None, :]
-        return np.asarray(out)
-
     def gather(self, per_view: FloatArray, per_point: FloatArray) -> FloatArray:
         """Return (m, C, c): sum over the views of each image of per_view^T per_point.
 
         Parameters
         ----------
-        per_view : (v, a, C)        per_point : (T, a, c)
+        per_view : (v, a, C), by image        per_point : (T, a, c)
         """
-        width, count = per_view.shape[2], per_point.shape[2]
+        depth, width, count = per_view.shape[1], per_view.shape[2], per_point.shape[2]
         out = np.empty((len(self.images), width, count))
-        flat, shown = per_view.reshape(-1, width), self.track
-        depth = per_view.shape[1]
+        flat, track = per_view.reshape(-1, width), self.track
         for k, (_, own) in enumerate(self.segments()):
             left = flat[depth * own.start : depth * own.stop]
-            np.matmul(left.T, per_point[shown[own]].reshape(-1, count), out=out[k])
+            np.matmul(left.T, per_point.take(track[own], axis=0).reshape(-1, count), out=out[k])
         return out
 
     def scatter(self, per_view: FloatArray, per_image: FloatArray) -> FloatArray:
@@ -66,15 +60,12 @@ class Neighbourhood:
 
         Parameters
         ----------
-        per_view : (v, C)        per_image : (m, C, c)
+        per_view : (v, C), by track        per_image : (m, C, c)
         """
         width = per_view.shape[1]
-        image = np.repeat(np.arange(len(self.images)), np.diff(self.starts))
-        order = np.argsort(self.track, kind="stable")
-        indices = (width * image[order, None] + np.arange(width)).astype(np.int32)
-        ends = np.concatenate([[0], np.cumsum(np.bincount(self.track, minlength=len(self.points)))])
+        indices = (width * self.image_of[:, None] + np.arange(width, dtype=np.int32)).astype(np.int32)
         matrix = sparse.csr_array(
-            (per_view[order].reshape(-1), indices.reshape(-1), (width * ends).astype(np.int32)),
+            (per_view.reshape(-1), indices.reshape(-1), (width * self.ends).astype(np.int32)),
             shape=(len(self.points), width * len(self.images)),
         )
         return np.asarray(matrix @ per_image.reshape(-1, per_image.shape[2]))
@@ -84,21 +75,19 @@ def neighbourhood(observations: JointObservations, points: IntArray) -> Neighbou
     """Collect all views of the given, distinct points."""
     first, last = observations.point_offsets[points], observations.point_offsets[points + 1]
     counts = last - first
-    ends = np.cumsum(counts)
-    position = np.arange(int(ends[-1]) if ends.size else 0) + np.repeat(first - (ends - counts), counts)
-    views = observations.by_point[position]
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    position = np.arange(int(ends[-1])) + np.repeat(first - ends[:-1], counts)
+    by_track = observations.by_point[position]
     track = np.repeat(np.arange(points.size), counts)
-    image = observations.image_idx[views]
-    order = np.argsort(image, kind="stable")
-    images, starts = np.unique(image[order], return_index=True)
-    return Neighbourhood(
-        observations,
-        points,
-        views[order],
-        track[order],
-        images.astype(np.int64),
-        np.append(starts, views.size).astype(np.int64),
-    )
+    image = observations.image_idx[by_track]
+    seen = np.zeros(len(observations.offsets) - 1, dtype=bool)
+    seen[image] = True
+    images = np.flatnonzero(seen)
+    image_of = (np.cumsum(seen) - 1)[image]
+    small = image_of.astype(np.uint16) if len(images) < 2**16 else image_of  # sorted by radix
+    order = np.argsort(small, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(image_of, minlength=len(images)))])
+    return Neighbourhood(points, images, starts, by_track[order], track[order], by_track, image_of, ends)
 
 
 def point_chunks(observations: JointObservations, points: IntArray) -> Iterator[slice]:

@@ -26,30 +26,54 @@ class ReducedSystem:
     before: FloatArray
 
 
-def reduced_system(observations: JointObservations, weight: FloatArray) -> ReducedSystem:
-    """Assemble (6) with the weights (n,) given, 1 / px^2."""
-    inverse = _point_inverse(observations, weight)
-    cleaned = off_points(observations, weight, inverse, observations.residuals_px)
+def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
+    """Assemble (6) with the robust weights and with w = 1; fills ``observations.crossed``."""
+    weights = observations.weight, observations.plain_weight
+    inverses = [_point_inverse(observations, weight) for weight in weights]
+    values_px = observations.residuals_px()
+    cleaned = [off_points(observations, *pair, values_px) for pair in zip(weights, inverses, strict=True)]
     layout = observations.layout
-    right, before = np.zeros(layout.num_columns + 1), np.zeros(layout.num_columns + 1)
-    blocks = _Blocks(layout.num_columns)
-    for image in np.flatnonzero(layout.has_columns).tolist():
+    right, before = np.zeros((2, layout.num_columns + 1)), np.zeros((2, layout.num_columns + 1))
+    blocks = _Blocks(layout.num_columns), _Blocks(layout.num_columns)
+    for image in observations.used_images:
+        rows, columns = observations.rows(image), layout.columns[image]
+        own = observations.nuisance(image)
+        jacobian = observations.jacobian(image) * observations.weight[rows, None, None]
+        np.matmul(jacobian.transpose(0, 2, 1), own, out=observations.crossed[rows])
+        for k, weight in enumerate(weights):
+            weighted = (own * weight[rows, None, None]).reshape(-1, layout.width)
+            gram = weighted.T @ own.reshape(-1, layout.width)
+            np.add.at(right[k], columns, cleaned[k][rows].reshape(-1) @ weighted)
+            np.add.at(before[k], columns, gram.diagonal())
+            blocks[k].add(columns, columns[None], gram[None])
+    if not observations.points_independent:
+        _eliminate_points(observations, inverses, blocks)
+    robust, plain = (
+        ReducedSystem(inverses[k], blocks[k].matrix(), right[k, :-1], before[k, :-1]) for k in range(len(weights))
+    )
+    return robust, plain
+
+
+def _eliminate_points(
+    observations: JointObservations, inverses: list[FloatArray], blocks: tuple[_Blocks, _Blocks]
+) -> None:
+    """Subtract sum W V^-1 W^T, image by image; only images that share points with it have an entry."""
+    layout = observations.layout
+    to_plain = observations.plain_weight / observations.weight
+    for image in observations.used_images:
         rows = observations.rows(image)
-        own, columns = observations.nuisance[rows], layout.columns[image]
-        weighted = own * weight[rows, None, None]
-        gram = weighted.reshape(-1, layout.width).T @ own.reshape(-1, layout.width)
-        np.add.at(right, columns, np.einsum("nac,na->c", weighted, cleaned[rows]))
-        np.add.at(before, columns, gram.diagonal())
-        blocks.add(columns, columns[None], gram[None])
-        if observations.points_independent or rows.start == rows.stop:
-            continue
         points, track = np.unique(observations.point_idx[rows], return_inverse=True)
         around = neighbourhood(observations, points)
-        crossed = np.einsum("nac,nai->nic", weighted, observations.point_jacobian[rows])
-        eliminated = inverse[points] @ sum_by_track(crossed, track, points.size)  # V^-1 W^T
-        slab = around.gather(around.point_nuisance(weight), eliminated)
-        blocks.add(columns, layout.columns[around.images], -slab.transpose(0, 2, 1))
-    return ReducedSystem(inverse, blocks.matrix(), right[:-1], before[:-1])
+        crossed = observations.crossed[around.views]
+        own = observations.crossed[rows]
+        columns, others = layout.columns[image], layout.columns[around.images]
+        for k, inverse in enumerate(inverses):
+            if k == 1:
+                crossed *= to_plain[around.views, None, None]
+                own = own * to_plain[rows, None, None]
+            eliminated = inverse[points] @ sum_by_track(own, track, points.size)  # V^-1 W^T
+            slab = around.gather(crossed, eliminated)
+            blocks[k].add(columns, others, -slab.transpose(0, 2, 1))
 
 
 def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr_array:
@@ -61,10 +85,8 @@ def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr
     """
     layout = observations.layout
     blocks = _Blocks(layout.num_columns)
-    for image in np.flatnonzero(layout.has_columns).tolist():
+    for image in observations.used_images:
         rows = observations.rows(image)
-        if rows.start == rows.stop:
-            continue
         points, track = np.unique(observations.point_idx[rows], return_inverse=True)
         around = neighbourhood(observations, points)
         own = sum_by_track(score[rows], track, points.size)
@@ -73,35 +95,35 @@ def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr
     return blocks.matrix()
 
 
-def nuisance_score(observations: JointObservations, weight: FloatArray, left_px: FloatArray) -> FloatArray:
-    """Return (n, C): w N^T y~ of every observation."""
-    weighted = left_px * weight[:, None]
-    out = observations.nuisance[:, 0] * weighted[:, 0, None]
-    out += observations.nuisance[:, 1] * weighted[:, 1, None]
-    return np.asarray(out)
-
-
 def off_points(
     observations: JointObservations, weight: FloatArray, point_inverse: FloatArray, values_px: FloatArray
 ) -> FloatArray:
     """Return values (n, 2) minus what moving the points alone would remove: J V^-1 J^T w."""
     if observations.points_independent:
         return values_px
-    jacobian, point_idx = observations.point_jacobian, observations.point_idx
-    weighted = values_px * weight[:, None]
+    jacobian, point_idx = observations.residuals.point_jacobian, observations.point_idx
+    source = observations.source
     pull = np.empty((observations.num_points, 3))
     for i in range(3):
-        along = jacobian[:, 0, i] * weighted[:, 0] + jacobian[:, 1, i] * weighted[:, 1]
-        pull[:, i] = np.bincount(point_idx, along, observations.num_points)
-    step = np.einsum("pij,pj->pi", point_inverse, pull)[point_idx]
-    return np.asarray(values_px - np.einsum("nai,ni->na", jacobian, step))
+        along = jacobian[0, i].take(source) * values_px[:, 0] + jacobian[1, i].take(source) * values_px[:, 1]
+        pull[:, i] = np.bincount(point_idx, along * weight, observations.num_points)
+    step = np.einsum("pij,pj->pi", point_inverse, pull)
+    out = values_px.copy()
+    for i in range(3):
+        moved = step[point_idx, i]
+        out[:, 0] -= jacobian[0, i].take(source) * moved
+        out[:, 1] -= jacobian[1, i].take(source) * moved
+    return out
 
 
 def _point_inverse(observations: JointObservations, weight: FloatArray) -> FloatArray:
     if observations.points_independent:
         return np.zeros((observations.num_points, 3, 3))
-    jacobian = observations.point_jacobian.transpose(1, 2, 0)
-    information = point_information(jacobian, weight, observations.point_idx, observations.num_points)
+    everywhere = np.zeros(observations.residuals.point_idx.size)
+    everywhere[observations.source] = weight
+    information = point_information(
+        observations.residuals.point_jacobian, everywhere, observations.residuals.point_idx, observations.num_points
+    )
     seen = np.flatnonzero(np.diff(observations.point_offsets) > 0)
     scale = np.sqrt(np.einsum("pii->pi", information[seen]))
     unit = information[seen] / scale[:, :, None] / scale[:, None, :]

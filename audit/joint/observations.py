@@ -23,24 +23,24 @@ _MIN_VIEWS: Final = 2
 class JointObservations:
     """The n observations of the system by image, in the order of ModelResiduals; C = ``layout.width``.
 
+    model, residuals: where they come from.
     offsets: (I + 1,) image i owns rows offsets[i]:offsets[i + 1].    source: (n,) columns of ModelResiduals.
     image_idx: (n,).    point_idx: (n,) rows of PointTable; of an independent point, the observation itself.
-    residuals_px: (n, 2).    nuisance: (n, 2, C) N, px per unit of the image's columns, zero in padding.
-    point_jacobian: (n, 2, 3) px per model unit, world frame.
+    crossed: (n, 3, C) w J^T N, what (6) sums to W^T; N itself is cheap to make again, see `nuisance`.
     weight: (n,) w / s^2 with w = min(1, 2.5 s / |eps|); plain_weight: (n,) 1 / s^2.    1 / px^2.
     sigma_px: (I,) s.    rms_px: (I,) of all inliers.
     by_point: (n,) rows by point, then in order; point_offsets: (P + 1,) point p owns by_point[o[p]:o[p + 1]].
     points_independent: whether points are known from elsewhere, so that nothing is eliminated.
     """
 
+    model: SparseModel
+    residuals: ModelResiduals
     layout: Layout
     offsets: IntArray
     source: IntArray
     image_idx: IntArray
     point_idx: IntArray
-    residuals_px: FloatArray
-    nuisance: FloatArray
-    point_jacobian: FloatArray
+    crossed: FloatArray
     weight: FloatArray
     plain_weight: FloatArray
     sigma_px: FloatArray
@@ -54,6 +54,11 @@ class JointObservations:
         """Rows of per-point arrays, points without observations included."""
         return len(self.point_offsets) - 1
 
+    @property
+    def used_images(self) -> list[int]:
+        """Images with columns and observations."""
+        return np.flatnonzero(self.layout.has_columns & (np.diff(self.offsets) > 0)).tolist()
+
     def rows(self, image_idx: int) -> slice:
         """Observations of an image."""
         return slice(int(self.offsets[image_idx]), int(self.offsets[image_idx + 1]))
@@ -61,6 +66,37 @@ class JointObservations:
     def num_of(self, image_idx: int) -> int:
         """How many observations an image has."""
         return int(self.offsets[image_idx + 1] - self.offsets[image_idx])
+
+    def residuals_px(self) -> FloatArray:
+        """(n, 2) observed minus projected."""
+        return np.ascontiguousarray(self.residuals.residuals_px.take(self.source, axis=1).T)
+
+    def jacobian(self, image_idx: int) -> FloatArray:
+        """J (n_i, 2, 3) of an image, px per model unit, world frame."""
+        source = self.source[self.rows(image_idx)]
+        return np.ascontiguousarray(self.residuals.point_jacobian.take(source, axis=2).transpose(2, 0, 1))
+
+    def project(self, image_idx: int) -> tuple[CameraRecord, ProjectedImage]:
+        """Camera of an image with columns and the projections of the points that it sees in the system."""
+        image = self.model.image(image_idx)
+        if image.camera is None:
+            raise ValueError(f"image {image.image_id} has columns but no camera")
+        points = self.residuals.point_idx[self.source[self.rows(image_idx)]]
+        return image.camera, project_image(image.camera, image.cam_from_world(self.model.points.xyz_world[points]))
+
+    def nuisance(self, image_idx: int) -> FloatArray:
+        """N (n_i, 2, C) of an image, px per unit of its columns; zero in padding and where it is not finite."""
+        camera, projected = self.project(image_idx)
+        out = np.zeros((self.num_of(image_idx), 2, self.layout.width))
+        out[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0)
+        if self.layout.has_rigs:
+            out[:, :, :NUM_POSE] = out[:, :, :NUM_POSE] @ self.layout.image_from_frame[image_idx]
+        params = list(self.layout.own_param_idxs[int(self.layout.camera_idx[image_idx])])
+        if params:
+            out[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
+        if camera.model.is_spherical:  # at the poles of a panorama a column may not be finite: no effect there
+            out[~np.isfinite(out)] = 0.0
+        return out
 
 
 def joint_observations(
@@ -96,15 +132,15 @@ def joint_observations(
     num_points = source.size if points_independent else len(model.points)
     by_point = np.argsort(point_idx, kind="stable").astype(np.int64)
     point_offsets = np.concatenate([[0], np.cumsum(np.bincount(point_idx, minlength=num_points))]).astype(np.int64)
-    out = JointObservations(
+    return JointObservations(
+        model,
+        residuals,
         layout,
         offsets,
         source,
         image_idx,
         point_idx,
-        np.ascontiguousarray(residuals.residuals_px[:, source].T),
-        np.zeros((source.size, 2, layout.width)),
-        np.ascontiguousarray(residuals.point_jacobian[:, :, source].transpose(2, 0, 1)),
+        np.zeros((source.size, 3, layout.width)),
         weight[source],
         plain[source],
         sigma_px,
@@ -113,33 +149,6 @@ def joint_observations(
         point_offsets,
         points_independent,
     )
-    for image in np.flatnonzero(used).tolist():
-        _fill_nuisance(out, model, residuals, image)
-    return out
-
-
-def project_observations(
-    model: SparseModel, residuals: ModelResiduals, observations: JointObservations, image_idx: int
-) -> tuple[CameraRecord, ProjectedImage]:
-    """Return the camera of an image with columns and the projections of the points that it sees in the system."""
-    image = model.image(image_idx)
-    if image.camera is None:
-        raise ValueError(f"image {image.image_id} has columns but no camera")
-    points = residuals.point_idx[observations.source[observations.rows(image_idx)]]
-    xyz_cam = image.cam_from_world(model.points.xyz_world.take(points, axis=0))
-    return image.camera, project_image(image.camera, xyz_cam)
-
-
-def _fill_nuisance(out: JointObservations, model: SparseModel, residuals: ModelResiduals, image_idx: int) -> None:
-    """Write N of one image; a column that is not finite somewhere has no effect there (poles of a panorama)."""
-    camera, projected = project_observations(model, residuals, out, image_idx)
-    layout, own = out.layout, out.nuisance[out.rows(image_idx)]
-    own[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0) @ layout.image_from_frame[image_idx]
-    params = list(layout.own_param_idxs[int(model.images.camera_idx[image_idx])])
-    if params:
-        own[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
-    if camera.model.is_spherical or not np.isfinite(own).all():
-        own[~np.isfinite(own)] = 0.0
 
 
 def _finite_images(residuals: ModelResiduals) -> BoolArray:

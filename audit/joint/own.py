@@ -64,10 +64,11 @@ def own_parameters(system: JointSystem) -> tuple[CameraStep, ...]:
     """
     layout = system.observations.layout
     cameras = np.unique(layout.camera_idx[layout.has_columns]).tolist()
-    return tuple(_camera_step(system, camera) for camera in cameras)
+    covariances = system.covariances([layout.own_of_camera(camera) for camera in cameras])
+    return tuple(_camera_step(system, camera, own) for camera, own in zip(cameras, covariances, strict=True))
 
 
-def _camera_step(system: JointSystem, camera_idx: int) -> CameraStep:
+def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -> CameraStep:
     observations, layout = system.observations, system.observations.layout
     camera = system.model.camera(camera_idx)
     columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
@@ -75,7 +76,7 @@ def _camera_step(system: JointSystem, camera_idx: int) -> CameraStep:
     n = int(np.diff(observations.offsets)[images].sum())
     sigma_px = float(np.median(observations.sigma_px[images]))
     step, plain = system.base.step[columns], system.plain_step[columns]
-    sd = np.sqrt(np.maximum(system.covariance(columns).diagonal(), 0.0))
+    sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     focal = np.array([sd[params.index(i)] / abs(camera.params[i]) for i in camera.model.focal_idxs])
     px = [sigma_px * math.sqrt(wald(system, columns, value) / n) if n else math.nan for value in (step, plain)]
     return CameraStep(

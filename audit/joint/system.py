@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from scipy import sparse
@@ -12,11 +14,14 @@ from scipy.sparse import linalg as sparse_linalg
 from audit.joint.gauge import gauge_directions
 from audit.joint.inverse import JointInverse, joint_inverse
 from audit.joint.layout import NUM_POSE
-from audit.joint.normal import ReducedSystem, nuisance_score, off_points, reduced_system, score_meat
+from audit.joint.normal import ReducedSystem, off_points, reduced_systems, score_meat
 from audit.joint.observations import JointObservations, joint_observations
 from audit.residuals import ModelResiduals
 from loaders.arrays import BoolArray, FloatArray, IntArray
 from loaders.model import SparseModel
+
+_DIRECT: Final = 1500  # columns up to which the plain step gets a factor of its own
+_COLUMNS_AT_ONCE: Final = 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,19 +92,40 @@ class JointSystem:
         if not layout.has_columns[image_idx]:
             return np.full((layout.width, layout.width), np.nan)
         columns = layout.columns[image_idx, own]
-        covariance = self.covariance(columns)
+        covariance = self.covariances([columns])[0]
         transform = np.eye(own.size)
         transform[:NUM_POSE, :NUM_POSE] = layout.image_from_frame[image_idx]
         return np.asarray(transform @ covariance @ transform.T)
 
-    def covariance(self, columns: IntArray) -> FloatArray:
-        """Return (k, k): sandwich S^+ M S^+ at some columns; NaN where a parameter is not identified."""
-        solved = self.base.inverse.main[:, columns]
-        out = np.asarray(solved.T @ (self.meat @ solved))
-        lost = self.base.inverse.unidentified[columns]
-        out[lost] = np.nan
-        out[:, lost] = np.nan
+    def covariances(self, blocks: Sequence[IntArray]) -> list[FloatArray]:
+        """Return the sandwich S^+ M S^+ (k, k) at each block of columns (k,); NaN where one is not identified."""
+        inverse, out = self.base.inverse, []
+        for batch in _batches(blocks):
+            columns = np.concatenate(batch)
+            rows = inverse.main[columns]
+            spread = (self.meat @ np.ascontiguousarray(rows.T)).T
+            start = 0
+            for block in batch:
+                own = slice(start, start + block.size)
+                start = own.stop
+                covariance = rows[own] @ spread[own].T
+                lost = inverse.unidentified[block]
+                covariance[lost] = np.nan
+                covariance[:, lost] = np.nan
+                out.append(0.5 * (covariance + covariance.T))
         return out
+
+
+def _batches(blocks: Sequence[IntArray]) -> Iterator[list[IntArray]]:
+    """Blocks in turn, a bounded number of columns at once."""
+    batch: list[IntArray] = []
+    for block in blocks:
+        batch.append(block)
+        if sum(b.size for b in batch) >= _COLUMNS_AT_ONCE:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def joint_system(
@@ -131,39 +157,38 @@ def joint_system(
         points_independent=points_independent,
     )
     gauge = gauge_directions(model, observations)
-    reduced = reduced_system(observations, observations.weight)
+    reduced, plain = reduced_systems(observations)
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main @ reduced.right
     nothing = np.zeros((0, observations.layout.width))
     base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing[:, :2], nothing, {}), step)
     meat = score_meat(observations, base.view_scores)
-    return JointSystem(model, residuals, base, reduced, meat, _plain_step(observations, base, gauge))
+    return JointSystem(model, residuals, base, reduced, meat, _plain_step(plain, base, gauge))
 
 
 def with_step(base: Base, step: FloatArray) -> Base:
     """Return the base with y~ = y - N step - J point_step of (7)."""
     observations = base.observations
     padded = np.append(step[: observations.layout.num_columns], 0.0)
-    left = observations.residuals_px.copy()
-    for image in np.flatnonzero(observations.layout.has_columns).tolist():
-        rows = observations.rows(image)
-        left[rows] -= observations.nuisance[rows] @ padded[observations.layout.columns[image]]
+    layout, weight = observations.layout, observations.weight
+    left = observations.residuals_px()
+    for image in observations.used_images:
+        left[observations.rows(image)] -= observations.nuisance(image) @ padded[layout.columns[image]]
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
-    left = off_points(observations, observations.weight, base.point_inverse, left)
-    return replace(
-        base, step=step, left_px=left, view_scores=nuisance_score(observations, observations.weight, left)
-    )
+    left = off_points(observations, weight, base.point_inverse, left)
+    scores = np.empty((len(left), layout.width))
+    for image in observations.used_images:
+        rows = observations.rows(image)
+        pulled = left[rows] * weight[rows, None]
+        scores[rows] = np.einsum("nac,na->nc", observations.nuisance(image), pulled)
+    return replace(base, step=step, left_px=left, view_scores=scores)
 
 
-def _plain_step(observations: JointObservations, base: Base, gauge: FloatArray) -> FloatArray:
+def _plain_step(plain: ReducedSystem, base: Base, gauge: FloatArray) -> FloatArray:
     """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
-    plain = reduced_system(observations, observations.plain_weight)
     if len(plain.right) <= _DIRECT:
         return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main @ plain.right)
     front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=lambda x: base.inverse.main @ x)
     step, _ = sparse_linalg.cg(plain.matrix, plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
     return np.asarray(step)
-
-
-_DIRECT = 1500
