@@ -59,25 +59,29 @@ def group_root(scores: CandidateScores, own: slice) -> FloatArray:
     """Return L (r, c) with L K L^T = 1, over eigenvalues above 1e-4 of the columns scaled by |E|."""
     length = np.sqrt(scores.sq_length[own])
     scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
-    values, vectors = np.linalg.eigh(scores.gram[own, own] * scale * scale[:, None])
+    gram = scores.gram[own, own] * scale * scale[:, None]
+    if not np.isfinite(gram).all():
+        return np.zeros((0, len(scale)))
+    values, vectors = np.linalg.eigh(gram)
     kept = values > KEPT_EIGENVALUE
     return np.asarray((vectors[:, kept] / np.sqrt(values[kept])).T * scale)
 
 
-def test_group(scores: CandidateScores, meat: FloatArray, own: slice, *, sigma_px: float, rms_px: float) -> GroupTest:
+def test_group(
+    scores: CandidateScores, meat: FloatArray, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float
+) -> GroupTest:
     """Test one group of an image's candidate fields.
 
     Parameters
     ----------
-    meat : (c, c) sum over tracks of G G^T, of all candidates
+    meat : (c, c) sum over tracks of G G^T, of all candidates        root : L of `group_root`
     """
     if not np.isfinite(scores.gram[own, own]).all():
         return untested(JointStatus.NOT_FINITE)
-    root = group_root(scores, own)
     rank, n = len(root), scores.num_observations
     if rank == 0:
         return untested(JointStatus.ABSORBED, 0)
-    clusters = min(int(np.count_nonzero(scores.track_score[:, own].any(axis=1))), n)
+    clusters = min(len(scores.track_score), n)
     if min(n, clusters) < MIN_OBSERVATIONS_PER_RANK * rank:
         return untested(JointStatus.NOT_ENOUGH_EVIDENCE, rank)
     z = root @ scores.score[own]

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from audit.joint.candidates import CandidateScores, candidate_scores
+from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from audit.joint.own import CameraStep
 from audit.joint.system import JointSystem
 from audit.misfit.capabilities import TERMS, Term
@@ -81,7 +81,7 @@ def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> li
             continue
         own = {i: _missing_fields(system, i) for i in camera.image_idxs.tolist() if system.observations.num_of(i)}
         out += _of_cameras(system, own, model, camera.camera_idx, camera.sd_focal_rel)
-        fields[camera.camera_idx] = {i: columns[:, :, :2] for i, columns in own.items()}
+        fields[camera.camera_idx] = {i: ImageFields(np.ascontiguousarray(f.fields[:, :, :2]), f.nuisance) for i, f in own.items()}
     by_size: dict[tuple[int, int], list[CameraStep]] = {}
     for camera in steps:
         record = system.model.camera(camera.camera_idx)
@@ -95,8 +95,8 @@ def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> li
     return out
 
 
-def _missing_fields(system: JointSystem, image: int) -> FloatArray:
-    """(n_i, 2, 6) px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
+def _missing_fields(system: JointSystem, image: int) -> ImageFields:
+    """Six columns, px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
     camera, projected = system.observations.project(image)
     fields = candidate_fields(camera, projected)
     out = np.zeros((6, *fields.shape[1:]))
@@ -104,7 +104,7 @@ def _missing_fields(system: JointSystem, image: int) -> FloatArray:
     out[2] = _next_radial(camera, projected)
     out[3] = fields[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
     out[4:] = fields[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
-    return np.ascontiguousarray(out.transpose(2, 1, 0))
+    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, projected))
 
 
 def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
@@ -130,7 +130,7 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
 
 def _of_cameras(
     system: JointSystem,
-    fields: Mapping[int, FloatArray],
+    fields: Mapping[int, ImageFields],
     camera: CameraRecord,
     camera_idx: int | None,
     sd_focal_rel: float,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from audit.joint.candidates import CandidateScores, candidate_scores
+from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from audit.joint.group_test import KEPT_EIGENVALUE
 from audit.joint.system import Base, IncludedFields, with_step
 from loaders.arrays import FloatArray
@@ -16,10 +16,15 @@ from loaders.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """Fields (n_i, 2, r) of one image, px per unit, that are to be free."""
+    """Fields of one image that are to be free."""
 
     image_idx: int
-    fields: FloatArray
+    image: ImageFields
+
+    @property
+    def fields(self) -> FloatArray:
+        """(n_i, 2, r) px per unit."""
+        return self.image.fields
 
 
 def include(base: Base, candidates: list[Candidate]) -> Base:
@@ -30,7 +35,7 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = K^+ u with K of all new fields together (those of two images meet in shared points), step -> step - B
     theta, and the inverse gets a border. Directions of K with unit columns below 1e-4 stay out, as in the test.
     """
-    scores = [candidate_scores(base, {c.image_idx: c.fields}) for c in candidates]
+    scores = [candidate_scores(base, {c.image_idx: c.image}) for c in candidates]
     starts = np.cumsum([0, *(c.fields.shape[2] for c in candidates)])
     size = base.inverse.size
     solution = np.empty((size, int(starts[-1])))

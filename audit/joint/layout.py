@@ -16,7 +16,7 @@ NUM_POSE: Final = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Columns of the joint system: six per frame, then the own parameters of each camera.
+    """Columns of the joint system: six per frame, and the own parameters of each camera.
 
     frame_idx: (I,) images of equal number move together, -1 where an image has no columns.
     image_from_frame: (I, 6, 6) what a perturbation of the frame (rotation, translation, in the frame's axes) does to
@@ -24,7 +24,8 @@ class Layout:
     camera_idx: (I,) rows of CameraTable, -1 where an image has no columns.
     own_param_idxs: per camera, which of its parameters are unknowns: all but the principal point.
     columns: (I, 6 + Q) of each image, the pose first; ``num_columns`` where a camera has fewer than Q own parameters.
-    own_columns: (C + 1,) first own column of each camera.    has_rigs: whether image_from_frame says anything.
+    own_columns: (C,) first own column of each camera.    num_columns: D, unknowns without points.
+    has_rigs: whether image_from_frame says anything.
     """
 
     frame_idx: IntArray
@@ -33,12 +34,8 @@ class Layout:
     own_param_idxs: tuple[tuple[int, ...], ...]
     columns: IntArray
     own_columns: IntArray
+    num_columns: int
     has_rigs: bool
-
-    @property
-    def num_columns(self) -> int:
-        """How many unknowns there are, 3D points not counted."""
-        return int(self.own_columns[-1])
 
     @property
     def width(self) -> int:
@@ -52,7 +49,7 @@ class Layout:
 
     def own_of_camera(self, camera_idx: int) -> IntArray:
         """Columns of a camera's own parameters."""
-        return np.arange(self.own_columns[camera_idx], self.own_columns[camera_idx + 1])
+        return self.own_columns[camera_idx] + np.arange(len(self.own_param_idxs[camera_idx]))
 
     def own_of_image(self, image_idx: int) -> IntArray:
         """Columns of the own parameters of an image's camera."""
@@ -84,19 +81,38 @@ def make_layout(
     for camera in range(num_cameras):
         seen = bool((camera_idx == camera).any())
         own.append(fitted_param_idxs(model.camera(camera).model) if seen else ())
-    distinct, dense = np.unique(frames[used], return_inverse=True)
+    first, dense = np.unique(frames[used], return_index=True, return_inverse=True)[1:]
     frame = np.full(num_images, -1, dtype=np.int64)
     frame[used] = dense
     counts = np.array([len(params) for params in own], dtype=np.int64)
-    own_columns = NUM_POSE * len(distinct) + np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    num_columns, extra = int(own_columns[-1]), int(counts.max(initial=0))
+    pose_columns, own_columns, num_columns = _numbered(np.flatnonzero(used)[first], camera_idx, counts)
+    extra = int(counts.max(initial=0))
     columns = np.full((num_images, NUM_POSE + extra), num_columns, dtype=np.int64)
-    columns[used, :NUM_POSE] = NUM_POSE * frame[used, None] + np.arange(NUM_POSE)
+    columns[used, :NUM_POSE] = pose_columns[frame[used], None] + np.arange(NUM_POSE)
     offset = np.arange(extra)
     wanted = own_columns[camera_idx[used], None] + offset
     columns[used, NUM_POSE:] = np.where(offset < counts[camera_idx[used], None], wanted, num_columns)
     transforms = np.tile(np.eye(NUM_POSE), (num_images, 1, 1)) if image_from_frame is None else image_from_frame
-    return Layout(frame, transforms, camera_idx, tuple(own), columns, own_columns, image_from_frame is not None)
+    return Layout(
+        frame, transforms, camera_idx, tuple(own), columns, own_columns, num_columns, image_from_frame is not None
+    )
+
+
+def _numbered(first_of_frame: IntArray, camera_idx: IntArray, counts: IntArray) -> tuple[IntArray, IntArray, int]:
+    """First column of each frame and of each camera, and their number.
+
+    A camera follows the first frame that it was seen in: what is used together lies together in memory.
+    """
+    num_frames = len(first_of_frame)
+    last = len(camera_idx)
+    first_of_camera = np.full(len(counts), last, dtype=np.int64)
+    images = np.flatnonzero(camera_idx >= 0)
+    np.minimum.at(first_of_camera, camera_idx[images], images)
+    order = np.argsort(np.concatenate([2 * first_of_frame, 2 * first_of_camera + 1]), kind="stable")
+    widths = np.concatenate([np.full(num_frames, NUM_POSE), counts])
+    starts = np.empty(len(widths), dtype=np.int64)
+    starts[order] = np.cumsum(widths[order]) - widths[order]
+    return starts[:num_frames], starts[num_frames:], int(widths.sum())
 
 
 def image_from_frame(rotation_sensor_from_rig: FloatArray, translation_sensor_from_rig: FloatArray) -> FloatArray:

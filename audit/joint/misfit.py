@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from audit.joint.candidates import CandidateScores, candidate_scores
+from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from audit.joint.group_test import GroupTest, JointStatus, group_root, test_group, untested
 from audit.joint.inclusion import Candidate, include
-from audit.joint.system import Base, JointSystem
+from audit.joint.system import JointSystem
 from audit.joint.worth import NO_WORTH, Worth, worth_of
 from audit.misfit.fields import GROUP_COLUMNS, GROUPS, MisfitGroup, candidate_fields
 from audit.multiplicity import benjamini_hochberg, holm
@@ -135,14 +134,15 @@ class _Rounds:
     def _test(self, chosen: BoolArray) -> None:
         for image in np.flatnonzero(chosen).tolist():
             scores = self._scores(image)
-            self.tests[image], self._worth[image] = _image_tests(self._system, self._base, image, scores)
+            self.tests[image], self._worth[image] = _image_tests(self._system, image, scores, self._alpha)
         waiting = np.flatnonzero(self._tested & (self._round < 0))
         p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()])
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
 
     def _scores(self, image: int) -> CandidateScores | None:
         fields = _fields_of(self._system, image)
-        return candidate_scores(self._base, {image: fields}) if fields.shape[2] and len(fields) else None
+        usable = bool(fields.fields.shape[2] and len(fields.fields))
+        return candidate_scores(self._base, {image: fields}) if usable else None
 
     def _significant(self, image: int) -> list[MisfitGroup]:
         return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
@@ -161,7 +161,8 @@ class _Rounds:
             if scores is not None:
                 own = GROUP_COLUMNS[group]
                 root = group_root(scores, own)
-                candidates.append(Candidate(image, _fields_of(self._system, image)[:, :, own] @ root.T))
+                fields = _fields_of(self._system, image)
+                candidates.append(Candidate(image, ImageFields(fields.fields[:, :, own] @ root.T, fields.nuisance)))
         self._base = include(self._base, candidates)
 
     def _touched(self, new: BoolArray) -> BoolArray:
@@ -197,32 +198,27 @@ class _Rounds:
         return max(material or significant, key=lambda group: tests[group].bic(n), default=None)
 
 
-def _fields_of(system: JointSystem, image: int) -> FloatArray:
-    """(n_i, 2, 42) candidate fields of an image, px per unit; (n_i, 2, 0) of panoramas."""
+def _fields_of(system: JointSystem, image: int) -> ImageFields:
+    """42 candidate fields of an image, px per unit; none of panoramas."""
     camera, projected = system.observations.project(image)
-    return np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
+    fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
+    return ImageFields(fields, system.observations.nuisance(image, projected))
 
 
 def _image_tests(
-    system: JointSystem, base: Base, image: int, scores: CandidateScores | None
+    system: JointSystem, image: int, scores: CandidateScores | None, alpha: float
 ) -> tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]:
+    """Tests of all groups, and the worth of those that may be significant."""
     if scores is None:
         return dict.fromkeys(GROUPS, untested(JointStatus.NO_FIELDS)), {}
     observations = system.observations
     sigma_px, rms_px = float(observations.sigma_px[image]), float(observations.rms_px[image])
     with np.errstate(over="ignore", invalid="ignore"):
         meat = scores.track_score.T @ scores.track_score
-    tests = {
-        group: test_group(scores, meat, own, sigma_px=sigma_px, rms_px=rms_px) for group, own in GROUP_COLUMNS.items()
-    }
-    worth = {
-        group: worth_of(system, base, image, scores, GROUP_COLUMNS[group])
-        for group, test in tests.items()
-        if test.status is JointStatus.TESTED
-    }
+    tests, worth = {}, {}
+    for group, own in GROUP_COLUMNS.items():
+        root = group_root(scores, own)
+        tests[group] = test_group(scores, meat, own, root, sigma_px=sigma_px, rms_px=rms_px)
+        if tests[group].p < alpha:
+            worth[group] = worth_of(system, image, scores, own, root)
     return tests, worth
-
-
-def flat_p(tests: Sequence[JointTests]) -> FloatArray:
-    """Return (I, 6) p in the order of GROUPS."""
-    return np.array([[image[group].p for group in GROUPS] for image in tests])

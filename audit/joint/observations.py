@@ -84,9 +84,9 @@ class JointObservations:
         points = self.residuals.point_idx[self.source[self.rows(image_idx)]]
         return image.camera, project_image(image.camera, image.cam_from_world(self.model.points.xyz_world[points]))
 
-    def nuisance(self, image_idx: int) -> FloatArray:
+    def nuisance(self, image_idx: int, projected: ProjectedImage | None = None) -> FloatArray:
         """N (n_i, 2, C) of an image, px per unit of its columns; zero in padding and where it is not finite."""
-        camera, projected = self.project(image_idx)
+        projected = self.project(image_idx)[1] if projected is None else projected
         out = np.zeros((self.num_of(image_idx), 2, self.layout.width))
         out[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0)
         if self.layout.has_rigs:
@@ -94,7 +94,7 @@ class JointObservations:
         params = list(self.layout.own_param_idxs[int(self.layout.camera_idx[image_idx])])
         if params:
             out[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
-        if camera.model.is_spherical:  # at the poles of a panorama a column may not be finite: no effect there
+        else:  # at the poles of a panorama a column may not be finite: no effect there
             out[~np.isfinite(out)] = 0.0
         return out
 

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from audit.joint.candidates import CandidateScores
-from audit.joint.group_test import group_root
 from audit.joint.layout import NUM_POSE
-from audit.joint.system import Base, JointSystem
+from audit.joint.system import JointSystem
 from loaders.arrays import FloatArray
 
 
@@ -28,8 +27,12 @@ class Worth(NamedTuple):
 NO_WORTH = Worth(math.nan, math.nan, math.nan)
 
 
-def worth_of(system: JointSystem, base: Base, image_idx: int, scores: CandidateScores, own: slice) -> Worth:
+def worth_of(system: JointSystem, image_idx: int, scores: CandidateScores, own: slice, root: FloatArray) -> Worth:
     """Return by how much the base moves an image when a group of its fields is admitted.
+
+    Parameters
+    ----------
+    root : L of `audit.joint.group_test.group_root`
 
     Notes
     -----
@@ -37,7 +40,6 @@ def worth_of(system: JointSystem, base: Base, image_idx: int, scores: CandidateS
     the model. C = -R^T t, and a left perturbation (w, t) moves it by -R^T t: |dC| = |t|.
     """
     layout = system.observations.layout
-    root = group_root(scores, own)
     theta = root.T @ (root @ scores.score[own])
     columns = layout.columns[image_idx]
     columns = columns[columns < layout.num_columns]
