@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -74,24 +74,19 @@ def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> li
     steps : of `own_parameters`
     """
     out: list[ImpliedParameter] = []
-    fields = {}
-    for camera in steps:
-        model = system.model.camera(camera.camera_idx)
-        if model.model.is_spherical or not camera.num_observations:
-            continue
-        own = {i: _missing_fields(system, i) for i in camera.image_idxs.tolist() if system.observations.num_of(i)}
-        out += _of_cameras(system, own, model, camera.camera_idx, camera.sd_focal_rel)
-        fields[camera.camera_idx] = {i: ImageFields(np.ascontiguousarray(f.fields[:, :, :2]), f.nuisance) for i, f in own.items()}
     by_size: dict[tuple[int, int], list[CameraStep]] = {}
     for camera in steps:
         record = system.model.camera(camera.camera_idx)
-        if camera.camera_idx in fields:
-            by_size.setdefault((record.width, record.height), []).append(camera)
+        if record.model.is_spherical or not camera.num_observations:
+            continue
+        by_size.setdefault((record.width, record.height), []).append(camera)
+        out += _of_images(system, camera.image_idxs, record, camera.camera_idx, camera.sd_focal_rel)
     for cameras in by_size.values():
         if len(cameras) > 1:
-            together = {i: columns for c in cameras for i, columns in fields[c.camera_idx].items()}
-            sd = float(np.median([c.sd_focal_rel for c in cameras]))
-            out += _of_cameras(system, together, system.model.camera(cameras[0].camera_idx), None, sd)
+            record = system.model.camera(cameras[0].camera_idx)
+            images = np.sort(np.concatenate([camera.image_idxs for camera in cameras]))
+            sd_focal_rel = float(np.median([camera.sd_focal_rel for camera in cameras]))
+            out += _of_images(system, images, record, None, sd_focal_rel)
     return out
 
 
@@ -105,6 +100,12 @@ def _missing_fields(system: JointSystem, image: int) -> ImageFields:
     out[3] = fields[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
     out[4:] = fields[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
     return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, projected))
+
+
+def _shift_fields(system: JointSystem, image: int) -> ImageFields:
+    """The two columns of the principal point, px."""
+    shift = np.tile(np.eye(2), (system.observations.num_of(image), 1, 1))
+    return ImageFields(shift, system.observations.nuisance(image))
 
 
 def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
@@ -128,17 +129,16 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
     return out
 
 
-def _of_cameras(
+def _of_images(
     system: JointSystem,
-    fields: Mapping[int, ImageFields],
+    image_idxs: IntArray,
     camera: CameraRecord,
     camera_idx: int | None,
     sd_focal_rel: float,
 ) -> list[ImpliedParameter]:
-    if not fields:
-        return []
-    scores = candidate_scores(system.base, fields)
-    images = np.array(sorted(fields), dtype=np.int64)
+    images = image_idxs[np.diff(system.observations.offsets)[image_idxs] > 0]
+    fields_of = partial(_missing_fields if camera_idx is not None else _shift_fields, system)
+    scores = candidate_scores(system.base, images.tolist(), fields_of)
     sigma_px = float(np.median(system.observations.sigma_px[images]))
     out = []
     for parameter, names, unit in _lacking(camera):

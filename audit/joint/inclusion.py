@@ -13,7 +13,6 @@ from audit.joint.system import Base, IncludedFields, with_step
 from loaders.arrays import FloatArray
 
 
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """Fields of one image that are to be free."""
@@ -35,7 +34,8 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = K^+ u with K of all new fields together (those of two images meet in shared points), step -> step - B
     theta, and the inverse gets a border. Directions of K with unit columns below 1e-4 stay out, as in the test.
     """
-    scores = [candidate_scores(base, {c.image_idx: c.image}) for c in candidates]
+    by_image = {c.image_idx: c.image for c in candidates}
+    scores = [candidate_scores(base, [c.image_idx], by_image.__getitem__) for c in candidates]
     starts = np.cumsum([0, *(c.fields.shape[2] for c in candidates)])
     size = base.inverse.size
     solution = np.empty((size, int(starts[-1])))

@@ -49,7 +49,7 @@ class Layout:
 
     def own_of_camera(self, camera_idx: int) -> IntArray:
         """Columns of a camera's own parameters."""
-        return self.own_columns[camera_idx] + np.arange(len(self.own_param_idxs[camera_idx]))
+        return np.asarray(self.own_columns[camera_idx] + np.arange(len(self.own_param_idxs[camera_idx])))
 
     def own_of_image(self, image_idx: int) -> IntArray:
         """Columns of the own parameters of an image's camera."""

@@ -141,8 +141,8 @@ class _Rounds:
 
     def _scores(self, image: int) -> CandidateScores | None:
         fields = _fields_of(self._system, image)
-        usable = bool(fields.fields.shape[2] and len(fields.fields))
-        return candidate_scores(self._base, {image: fields}) if usable else None
+        usable = bool(fields.fields.size)
+        return candidate_scores(self._base, [image], lambda _: fields) if usable else None
 
     def _significant(self, image: int) -> list[MisfitGroup]:
         return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
@@ -150,7 +150,10 @@ class _Rounds:
     def _effects(self) -> FloatArray:
         """(I,) largest effect among significant groups."""
         return np.array(
-            [max((self.tests[i][group].px for group in self._significant(i)), default=0.0) for i in range(len(self.tests))]
+            [
+                max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
+                for i in range(len(self.tests))
+            ]
         )
 
     def _include(self, new: BoolArray) -> None:
@@ -187,9 +190,7 @@ class _Rounds:
             tests.append(joint)
             causes.append(self._cause(image, joint))
         effect = np.where(self._tested, self._effects(), np.nan)
-        return JointMisfit(
-            tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most
-        )
+        return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
 
     def _cause(self, image: int, tests: JointTests) -> MisfitGroup | None:
         significant = self._significant(image)

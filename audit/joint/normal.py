@@ -101,19 +101,26 @@ def off_points(
     """Return values (n, 2) minus what moving the points alone would remove: J V^-1 J^T w."""
     if observations.points_independent:
         return values_px
-    jacobian, point_idx = observations.residuals.point_jacobian, observations.point_idx
-    source = observations.source
-    pull = np.empty((observations.num_points, 3))
-    for i in range(3):
-        along = jacobian[0, i].take(source) * values_px[:, 0] + jacobian[1, i].take(source) * values_px[:, 1]
-        pull[:, i] = np.bincount(point_idx, along * weight, observations.num_points)
-    step = np.einsum("pij,pj->pi", point_inverse, pull)
+    step = point_steps(observations, weight, point_inverse, values_px)
+    jacobian, source = observations.residuals.point_jacobian, observations.source
     out = values_px.copy()
     for i in range(3):
-        moved = step[point_idx, i]
+        moved = step[observations.point_idx, i]
         out[:, 0] -= jacobian[0, i].take(source) * moved
         out[:, 1] -= jacobian[1, i].take(source) * moved
     return out
+
+
+def point_steps(
+    observations: JointObservations, weight: FloatArray, point_inverse: FloatArray, values_px: FloatArray
+) -> FloatArray:
+    """Return (P, 3): where values (n, 2) pull the points, V^-1 J^T w, world frame."""
+    jacobian, source = observations.residuals.point_jacobian, observations.source
+    pull = np.empty((observations.num_points, 3))
+    for i in range(3):
+        along = jacobian[0, i].take(source) * values_px[:, 0] + jacobian[1, i].take(source) * values_px[:, 1]
+        pull[:, i] = np.bincount(observations.point_idx, along * weight, observations.num_points)
+    return np.asarray(np.einsum("pij,pj->pi", point_inverse, pull))
 
 
 def _point_inverse(observations: JointObservations, weight: FloatArray) -> FloatArray:

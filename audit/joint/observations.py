@@ -159,7 +159,7 @@ def _finite_images(residuals: ModelResiduals) -> BoolArray:
 
 
 def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) -> tuple[FloatArray, FloatArray]:
-    """w / s^2 and 1 / s^2 of all inliers; NaN without noise."""
+    """Return w / s^2 and 1 / s^2 of all inliers; NaN without noise."""
     sigma = np.repeat(sigma_px, counts)
     length = np.sqrt((residuals.residuals_px**2).sum(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,7 +14,7 @@ from scipy.sparse import linalg as sparse_linalg
 from audit.joint.gauge import gauge_directions
 from audit.joint.inverse import JointInverse, joint_inverse
 from audit.joint.layout import NUM_POSE
-from audit.joint.normal import ReducedSystem, off_points, reduced_systems, score_meat
+from audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
 from audit.joint.observations import JointObservations, joint_observations
 from audit.residuals import ModelResiduals
 from loaders.arrays import BoolArray, FloatArray, IntArray
@@ -41,7 +41,8 @@ class IncludedFields:
 class Base:
     """What candidates are tested against: everything that was or could be fitted.
 
-    inverse: S^+.    step: (D + m,) S^+ g.    left_px: (n, 2) y~.    view_scores: (n, C) h = w N^T y~.
+    inverse: S^+.    step: (D + m,) S^+ g.    point_step: (P, 3).    left_px: (n, 2) y~.
+    view_scores: (n, C) h = w N^T y~.
     included: by image.
     """
 
@@ -49,6 +50,7 @@ class Base:
     point_inverse: FloatArray
     inverse: JointInverse
     step: FloatArray
+    point_step: FloatArray
     left_px: FloatArray
     view_scores: FloatArray
     included: dict[int, IncludedFields]
@@ -80,6 +82,19 @@ class JointSystem:
         points = self.residuals.point_idx[self.observations.source[self.observations.rows(image_idx)]]
         xyz_cam = self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(points, axis=0))
         return float(np.median(xyz_cam[:, 2])) if len(xyz_cam) else math.nan
+
+    def relief_change(self, image_idx: int) -> float:
+        """By how much the step changes an image's depth relative to the relief of its points (relative change)."""
+        observations, layout = self.observations, self.observations.layout
+        rows, image = observations.rows(image_idx), self.model.image(image_idx)
+        points = self.residuals.point_idx[observations.source[rows]]
+        xyz_cam = image.cam_from_world(self.model.points.xyz_world.take(points, axis=0))
+        pose = layout.image_from_frame[image_idx] @ self.base.step[layout.pose_of_image(image_idx)]
+        moved = np.cross(pose[:3], xyz_cam) + pose[3:]
+        moved += self.base.point_step[observations.point_idx[rows]] @ image.rotation_cam_from_world.T
+        depth = xyz_cam[:, 2]
+        slope, shift = np.polyfit(depth - np.median(depth), moved[:, 2], 1)
+        return float(shift / np.median(depth) - slope)
 
     def image_covariance(self, image_idx: int) -> FloatArray:
         """Return (6 + q, 6 + q): sandwich covariance S^+ M S^+ of an image's pose and own parameters.
@@ -161,7 +176,9 @@ def joint_system(
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main @ reduced.right
     nothing = np.zeros((0, observations.layout.width))
-    base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing[:, :2], nothing, {}), step)
+    base = with_step(
+        Base(observations, reduced.point_inverse, inverse, step, nothing[:, :3], nothing[:, :2], nothing, {}), step
+    )
     meat = score_meat(observations, base.view_scores)
     return JointSystem(model, residuals, base, reduced, meat, _plain_step(plain, base, gauge))
 
@@ -176,13 +193,14 @@ def with_step(base: Base, step: FloatArray) -> Base:
         left[observations.rows(image)] -= observations.nuisance(image) @ padded[layout.columns[image]]
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
+    moved = point_steps(observations, weight, base.point_inverse, left)
     left = off_points(observations, weight, base.point_inverse, left)
     scores = np.empty((len(left), layout.width))
     for image in observations.used_images:
         rows = observations.rows(image)
         pulled = left[rows] * weight[rows, None]
         scores[rows] = np.einsum("nac,na->nc", observations.nuisance(image), pulled)
-    return replace(base, step=step, left_px=left, view_scores=scores)
+    return replace(base, step=step, point_step=moved, left_px=left, view_scores=scores)
 
 
 def _plain_step(plain: ReducedSystem, base: Base, gauge: FloatArray) -> FloatArray:

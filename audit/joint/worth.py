@@ -1,4 +1,4 @@
-"""What is a misfit worth? The pose and focal length that the image would get if the group were admitted (section 11)."""
+"""What is a misfit worth? The pose and focal length of the image if the group were admitted (section 11)."""
 
 from __future__ import annotations
 
