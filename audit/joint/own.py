@@ -20,7 +20,7 @@ class CameraStep:
     """What adjusting everything would do to one camera's own parameters.
 
     camera_idx: row of CameraTable.    image_idxs: its images in the system.    num_observations: theirs.
-    names: (q,) own parameters.    stored, step, sd: (q,) in the units of the parameters. sd: sandwich clustered by track,
+    names: (q,) own parameters.    stored, step, sd: (q,) in their units. sd: sandwich clustered by track,
     NaN where the parameter is not identified.
     implied: (q,) the values that the step speaks for: stored + step, but see `_implied_focal`.
     plain_step: (q,) with w = 1: what a least-squares adjuster would do. Nothing should be rejected unless both agree.
@@ -52,7 +52,7 @@ class CameraStep:
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """What freeing parts of an image would gain, in units of the noise squared: pose, camera, both."""
+    """What freeing the pose alone, the camera alone, or both would gain, in units of the noise squared."""
 
     pose: float
     camera: float
@@ -146,12 +146,21 @@ def wald(system: JointSystem, columns: IntArray, step: FloatArray) -> float:
 
 
 def image_gains(system: JointSystem, image_idx: int) -> Gains:
-    """Return what freeing an image's pose, its camera's own parameters, or both would gain (pose or camera?)."""
+    """Return what freeing an image's pose alone, its camera's own parameters alone, or both would gain.
+
+    Notes
+    -----
+    Everything else is free. step_b^T [(S^+)_bb]^-1 step_b of the camera is what it gains *beside* a free pose, so the
+    pose alone gains the rest of both, and the other way round: a focal length that nobody adjusted to gains
+    everything alone, and next to nothing beside a pose that makes up for it.
+    """
     layout = system.observations.layout
     if not layout.has_columns[image_idx]:
         return Gains(math.nan, math.nan, math.nan)
     columns = layout.columns[image_idx]
     columns = columns[columns < layout.num_columns]
     step = system.base.step[columns]
-    pose, camera = slice(None, NUM_POSE), slice(NUM_POSE, None)
-    return Gains(*(wald(system, columns[part], step[part]) for part in (pose, camera, slice(None))))
+    both = wald(system, columns, step)
+    beside_camera = wald(system, columns[:NUM_POSE], step[:NUM_POSE])
+    beside_pose = wald(system, columns[NUM_POSE:], step[NUM_POSE:])
+    return Gains(pose=both - beside_pose, camera=both - beside_camera, both=both)
