@@ -1,4 +1,4 @@
-"""method.md sections 11 and 11b once more, slowly: every column stacked, NumPy's least squares; and models to try it on."""
+"""method.md sections 11 and 11b once more, slowly: every column stacked, NumPy's least squares; and models for it."""
 
 from __future__ import annotations
 

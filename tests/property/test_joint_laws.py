@@ -1,4 +1,4 @@
-"""Laws of the joint system: what must not change when the world is moved, scaled, reordered, or measured in other units."""
+"""Laws of the joint system: what must not change when the world is moved, scaled, reordered, measured otherwise."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def assert_same(found, expected, order=None):
     (system, steps, misfit, implied), (old_system, old_steps, old_misfit, old_implied) = found, expected
     order = range(len(misfit.tests)) if order is None else order
     for new, old in zip(steps, old_steps, strict=True):
-        assert_allclose(new.step, old.step, atol=1e-5 * old.sd)
-        assert_allclose(new.plain_step, old.plain_step, atol=1e-5 * old.sd)
+        assert_allclose(new.step / old.sd, old.step / old.sd, atol=1e-5)
+        assert_allclose(new.plain_step / old.sd, old.plain_step / old.sd, atol=1e-5)
         assert_allclose(new.sd, old.sd, rtol=1e-6)
         assert_allclose(new.own_step_px, old.own_step_px, rtol=1e-5, atol=1e-7)
     for new, old in zip(implied, old_implied, strict=True):
         assert new.found == old.found
-        assert_allclose(new.step, old.step, atol=1e-4 * np.nan_to_num(old.sd))
+        assert_allclose(new.step / old.sd, old.step / old.sd, atol=1e-4)
         assert_allclose(new.sd, old.sd, rtol=1e-5)
     for new_idx, old_idx in enumerate(order):
         assert misfit.included[new_idx] == old_misfit.included[old_idx]
@@ -64,7 +64,7 @@ def assert_same(found, expected, order=None):
             assert_allclose(new.worth, old.worth, rtol=1e-3, atol=1e-7)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=seeds, turn=st.integers(0, 2**32 - 1), gain=st.sampled_from([1e-3, 1.0, 250.0]))
 def test_the_frame_and_the_unit_of_the_world_do_not_matter(seed, turn, gain):
     model, rng = scene(seed), np.random.default_rng(turn)
@@ -76,7 +76,7 @@ def test_the_frame_and_the_unit_of_the_world_do_not_matter(seed, turn, gain):
     assert_same(answers(dataclasses.replace(moved, points=points)), told(seed))
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds, order=st.permutations(range(SPEC.num_images)))
 def test_the_order_of_the_images_does_not_matter(seed, order):
     model = scene(seed)
@@ -101,7 +101,7 @@ def test_the_order_of_the_images_does_not_matter(seed, order):
     assert_same(answers(shuffled), told(seed), order)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds, data=st.data())
 def test_the_order_of_the_points_does_not_matter(seed, data):
     model = scene(seed)
@@ -112,7 +112,7 @@ def test_the_order_of_the_points_does_not_matter(seed, data):
     assert_same(answers(dataclasses.replace(model, points=points, observations=observations)), told(seed))
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=seeds, gain=st.sampled_from([0.5, 4.0]))
 def test_more_pixels_of_the_same_picture_say_the_same(seed, gain):
     """Image, keypoints, focal length and principal point times ``gain``: px scale, ranks, p and k1 do not."""
@@ -128,7 +128,7 @@ def test_more_pixels_of_the_same_picture_say_the_same(seed, gain):
     observations = dataclasses.replace(model.observations, xy_px=gain * model.observations.xy_px)
     found = answers(dataclasses.replace(model, cameras=scaled, observations=observations))
     for new, old in zip(found[1], told(seed)[1], strict=True):
-        assert_allclose(new.step, old.step * [gain, 1.0], atol=1e-5 * new.sd)
+        assert_allclose(new.step / new.sd, old.step * [gain, 1.0] / new.sd, atol=1e-5)
         assert_allclose(new.own_step_px, gain * old.own_step_px, rtol=1e-5, atol=1e-7)
         assert_allclose(new.sd_focal_rel, old.sd_focal_rel, rtol=1e-6)
     first = joint_misfit(found[0], alpha=1e-12, tau_px=TAU_PX)
@@ -139,7 +139,7 @@ def test_more_pixels_of_the_same_picture_say_the_same(seed, gain):
             assert_allclose(new[group].px, gain * old[group].px, rtol=1e-4, atol=1e-6)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=seeds, alpha=st.sampled_from([0.05, 0.5, 0.999]), tau=st.sampled_from([1e-6, 0.05, 0.2]))
 def test_no_effect_exceeds_what_is_possible(seed, alpha, tau):
     system = told(seed)[0]
