@@ -1,5 +1,7 @@
 """What would adjusting everything do, and what is left that nothing could take up? (method.md sections 11 and 11b)."""
 
+from audit.joint.audit import JointAudit, audit_jointly
+from audit.joint.blocks import covisible_blocks
 from audit.joint.group_test import JointStatus
 from audit.joint.implied import Implied, ImpliedParameter, implied_parameters
 from audit.joint.layout import image_from_frame
@@ -13,12 +15,15 @@ __all__ = [
     "Gains",
     "Implied",
     "ImpliedParameter",
+    "JointAudit",
     "JointMisfit",
     "JointStatus",
     "JointSystem",
     "JointTest",
     "JointTests",
     "Worth",
+    "audit_jointly",
+    "covisible_blocks",
     "image_from_frame",
     "image_gains",
     "implied_parameters",

@@ -12,6 +12,7 @@ from audit.joint.layout import NUM_POSE
 from audit.joint.system import JointSystem
 from loaders.arrays import FloatArray, IntArray
 
+MIN_SDS: Final = 5.0
 _CURVED: Final = 0.01  # relative step of a focal length from which on its second order matters
 
 
@@ -42,6 +43,11 @@ class CameraStep:
     sd_focal_rel: float
     focal_identified: bool
     implied: FloatArray
+
+    def is_material(self, tau_px: float, min_sds: float = MIN_SDS) -> bool:
+        """Whether both steps gain more than tau and a parameter moves by more than ``min_sds`` sd in both."""
+        gain_px = min(self.own_step_px, self.plain_step_px)
+        return bool(gain_px > tau_px and (np.abs(self.agreed) > min_sds * self.sd).any())
 
     @property
     def agreed(self) -> FloatArray:
