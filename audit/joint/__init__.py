@@ -1,0 +1,33 @@
+"""What would adjusting everything do, and what is left that nothing could take up? (method.md sections 11 and 11b)."""
+
+from audit.joint.audit import JointAudit, audit_jointly
+from audit.joint.blocks import covisible_blocks
+from audit.joint.group_test import JointStatus
+from audit.joint.implied import Implied, ImpliedParameter, implied_parameters
+from audit.joint.layout import image_from_frame
+from audit.joint.misfit import JointMisfit, JointTest, JointTests, joint_misfit
+from audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from audit.joint.system import JointSystem, joint_system
+from audit.joint.worth import Worth
+
+__all__ = [
+    "CameraStep",
+    "Gains",
+    "Implied",
+    "ImpliedParameter",
+    "JointAudit",
+    "JointMisfit",
+    "JointStatus",
+    "JointSystem",
+    "JointTest",
+    "JointTests",
+    "Worth",
+    "audit_jointly",
+    "covisible_blocks",
+    "image_from_frame",
+    "image_gains",
+    "implied_parameters",
+    "joint_misfit",
+    "joint_system",
+    "own_parameters",
+]

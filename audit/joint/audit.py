@@ -1,0 +1,141 @@
+"""All that the joint system says of a model, whatever its size: the door of this room (method.md sections 11, 11b)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from audit.joint.blocks import Block, covisible_blocks
+from audit.joint.implied import ImpliedParameter, implied_parameters
+from audit.joint.misfit import JointMisfit, joint_misfit
+from audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from audit.joint.system import JointSystem, joint_system
+from audit.residuals import ModelResiduals
+from loaders.arrays import BoolArray, FloatArray, IntArray
+from loaders.model import SparseModel
+
+MAX_COLUMNS: Final = 10_000
+"""Of one dense factor: 800 MB."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointAudit:
+    """Steps, misfit, implied parameters and covariances of a model.
+
+    steps: of every camera with images in the system.    misfit: of every image.    implied: see `ImpliedParameter`.
+    gains: per image.    covariances: per image, see `JointSystem.image_covariances`.
+    excluded: (I,) images whose misfit was not asked for.
+    num_blocks: more than one where the model was too large for one system; numbers are then those of blocks: a camera
+    that several blocks share is told of by the block that has most of its observations, q is of the block's images.
+    """
+
+    steps: tuple[CameraStep, ...]
+    misfit: JointMisfit
+    implied: list[ImpliedParameter]
+    gains: tuple[Gains, ...]
+    covariances: tuple[FloatArray, ...]
+    excluded: BoolArray
+    num_blocks: int
+
+
+def audit_jointly(
+    model: SparseModel,
+    residuals: ModelResiduals,
+    sigma_px: FloatArray,
+    *,
+    alpha: float,
+    tau_px: FloatArray,
+    excluded: BoolArray | None = None,
+    left_out: BoolArray | None = None,
+    frame_idx: IntArray | None = None,
+    image_from_frame: FloatArray | None = None,
+    points_independent: bool = False,
+    max_columns: int = MAX_COLUMNS,
+) -> JointAudit:
+    """Ask the joint system everything.
+
+    Parameters
+    ----------
+    sigma_px, tau_px : (I,) noise and materiality, px
+    excluded : (I,) images that are wrong in another way (pose); they and the images of cameras with a material own
+        step are not tested for misfit, see `joint_misfit`
+    left_out : (I,) images that take no part at all (section 12)
+    frame_idx, image_from_frame, points_independent : see `joint_system`
+    max_columns : of one dense system
+    """
+    parts = []
+    for block in covisible_blocks(model, residuals, max_columns, frame_idx):
+        outside = ~block.members if left_out is None else ~block.members | left_out
+        system = joint_system(
+            model,
+            residuals,
+            sigma_px,
+            frame_idx=frame_idx,
+            image_from_frame=image_from_frame,
+            left_out=outside,
+            points_independent=points_independent,
+        )
+        parts.append(_of_block(system, block, alpha, tau_px, excluded))
+        del system
+    return parts[0][1] if len(parts) == 1 else _merged(parts, tau_px)
+
+
+def _of_block(
+    system: JointSystem, block: Block, alpha: float, tau_px: FloatArray, excluded: BoolArray | None
+) -> tuple[Block, JointAudit]:
+    steps = own_parameters(system)
+    out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
+    for step in steps:
+        if step.is_material(float(np.median(tau_px[step.image_idxs]))):
+            out[step.image_idxs] = True
+    implied = implied_parameters(system, steps)
+    core = np.flatnonzero(block.core).tolist()
+    gains = [Gains(math.nan, math.nan, math.nan)] * len(block.core)
+    covariances = [np.zeros((0, 0))] * len(block.core)
+    for image, covariance in zip(core, system.image_covariances(core), strict=True):
+        gains[image], covariances[image] = image_gains(system, image), covariance
+    misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out)
+    return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, 1)
+
+
+def _merged(parts: list[tuple[Block, JointAudit]], tau_px: FloatArray) -> JointAudit:
+    """Each image as its core's block says, each camera as the block with most of its observations says."""
+    num_images = len(parts[0][0].core)
+    by_core = np.zeros(num_images, dtype=np.int64)
+    steps: dict[int, CameraStep] = {}
+    told_by: dict[int, int] = {}
+    for number, (block, found) in enumerate(parts):
+        by_core[block.core] = number
+        for step in found.steps:
+            best = steps.get(step.camera_idx)
+            if best is None or step.num_observations > best.num_observations:
+                steps[step.camera_idx], told_by[step.camera_idx] = step, number
+    source = [parts[number][1] for number in by_core.tolist()]
+    effect = np.array([found.misfit.effect_px[i] for i, found in enumerate(source)])
+    tested = np.count_nonzero(~np.isnan(effect))
+    misfit = JointMisfit(
+        tuple(found.misfit.tests[i] for i, found in enumerate(source)),
+        effect,
+        np.array([found.misfit.included[i] for i, found in enumerate(source)]),
+        tuple(found.misfit.round_included[i] for i, found in enumerate(source)),
+        tuple(found.misfit.cause[i] for i, found in enumerate(source)),
+        bool(2 * np.count_nonzero(effect > tau_px) > tested),
+    )
+    implied = [
+        one
+        for number, (_, found) in enumerate(parts)
+        for one in found.implied
+        if one.camera_idx is None or told_by[one.camera_idx] == number
+    ]
+    return JointAudit(
+        tuple(steps[camera] for camera in sorted(steps)),
+        misfit,
+        implied,
+        tuple(found.gains[i] for i, found in enumerate(source)),
+        tuple(found.covariances[i] for i, found in enumerate(source)),
+        np.array([found.excluded[i] for i, found in enumerate(source)]),
+        len(parts),
+    )

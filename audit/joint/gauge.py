@@ -1,0 +1,66 @@
+"""Moves of the whole world that no observation sees: seven per connected component (method.md section 11)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from audit.joint.layout import NUM_POSE, cross_matrix
+from audit.joint.observations import JointObservations
+from loaders.arrays import FloatArray, IntArray
+from loaders.model import SparseModel
+
+NUM_GAUGE = 7
+
+
+def gauge_directions(model: SparseModel, observations: JointObservations) -> FloatArray:
+    """Return (D, 7 c): world translations, rotations and scale of each of the c connected components.
+
+    With left perturbations and points that follow: translation d: t_i = -R_i d; rotation w about the centre of the
+    component: w_i = -R_i w, t_i = (R_i w) x t_i; scale: t_i. Independent points hold the world: no direction is free.
+    A frame of several images takes them from its first image; whether a rig allows the direction (a known baseline
+    leaves no scale) is for the caller to see from S.
+    """
+    layout = observations.layout
+    if observations.points_independent:
+        return np.zeros((layout.num_columns, 0))
+    label = _components(observations)
+    out = []
+    for component in np.unique(label[label >= 0]).tolist():
+        images = np.flatnonzero(label == component)
+        out.append(_of_component(model, observations, images))
+    return np.hstack(out) if out else np.zeros((layout.num_columns, 0))
+
+
+def _components(observations: JointObservations) -> IntArray:
+    """(I,) component of each image with columns, -1 for the others."""
+    layout = observations.layout
+    num_images, num_points = len(layout.camera_idx), observations.num_points
+    used = np.flatnonzero(layout.has_columns)
+    num_nodes = num_images + num_points + int(layout.frame_idx.max(initial=-1)) + 1
+    first = np.concatenate([observations.image_idx, used])
+    second = np.concatenate([num_images + observations.point_idx, num_images + num_points + layout.frame_idx[used]])
+    edges = sparse.coo_array((np.ones(first.size, dtype=np.int8), (first, second)), shape=(num_nodes, num_nodes))
+    _, label = connected_components(edges.tocsr(), directed=False)
+    return np.where(layout.has_columns, label[:num_images], -1).astype(np.int64)
+
+
+def _of_component(model: SparseModel, observations: JointObservations, images: IntArray) -> FloatArray:
+    layout = observations.layout
+    records = [model.image(i) for i in images.tolist()]
+    rotation = np.array([record.rotation_cam_from_world for record in records])
+    shift = np.array([record.translation_cam_from_world for record in records])
+    centres = -np.einsum("iba,ib->ia", rotation, shift)
+    shift = shift + rotation @ np.median(centres, axis=0)  # coordinates far from zero would cost digits
+    out = np.zeros((layout.num_columns, NUM_GAUGE))
+    _, first = np.unique(layout.frame_idx[images], return_index=True)
+    for k in first.tolist():
+        own = np.zeros((NUM_POSE, NUM_GAUGE))
+        own[3:, :3] = -rotation[k]
+        own[:3, 3:6] = -rotation[k]
+        own[3:, 3:6] = -cross_matrix(shift[k]) @ rotation[k]
+        own[3:, 6] = shift[k]
+        image = int(images[k])
+        out[layout.pose_of_image(image)] = np.linalg.solve(layout.image_from_frame[image], own)
+    return out

@@ -1,0 +1,173 @@
+"""What would a parameter be that nobody freed? Each candidate joins the base alone (method.md section 11)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from audit.joint.own import CameraStep
+from audit.joint.system import JointSystem
+from audit.misfit.capabilities import TERMS, Term
+from audit.misfit.fields import GROUP_COLUMNS, MisfitGroup, candidate_fields
+from audit.misfit.nuisance import ProjectedImage
+from loaders.arrays import FloatArray, IntArray
+from loaders.model import CameraRecord
+
+MAX_SD_FOCAL_REL: Final = 0.003
+MIN_SDS: Final = 5.0
+MIN_SHIFT_OVER_WIDTH: Final = 0.004
+MIN_GAIN_PX: Final = 0.1
+_ABSORBED: Final = 1e-10  # of K with unit columns; 8 px of a common principal point leave 1e-5 of their square
+_RADIAL: Final = (Term.RADIAL_2, Term.RADIAL_4, Term.RADIAL_6)
+
+
+class Implied(StrEnum):
+    """Parameters that the camera model lacks or that nobody refines."""
+
+    PRINCIPAL_POINT = "principal_point"
+    RADIAL = "radial"
+    ASPECT = "aspect"
+    TANGENTIAL = "tangential"
+
+
+_COLUMNS: Final = {
+    Implied.PRINCIPAL_POINT: slice(0, 2),
+    Implied.RADIAL: slice(2, 3),
+    Implied.ASPECT: slice(3, 4),
+    Implied.TANGENTIAL: slice(4, 6),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImpliedParameter:
+    """A parameter's implied change, had it alone been free beside the base.
+
+    image_idxs: the images that it was one parameter of.    camera_idx: None for all cameras of one image size.
+    names, unit, step, sd: (k,) of the change; sd is a sandwich clustered by track.
+    sd_focal_rel: of the camera (the median over the cameras) in the base system.
+    px: what freeing it would gain, RMS px.    found: whether the rule of section 11 makes a finding of it.
+    """
+
+    parameter: Implied
+    camera_idx: int | None
+    image_idxs: IntArray
+    names: tuple[str, ...]
+    unit: str
+    step: FloatArray
+    sd: FloatArray
+    sd_focal_rel: float
+    px: float
+    found: bool
+
+
+def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> list[ImpliedParameter]:
+    """Return what every camera's missing parameters would be, then a principal point common to each image size.
+
+    Parameters
+    ----------
+    steps : of `own_parameters`
+    """
+    out: list[ImpliedParameter] = []
+    by_size: dict[tuple[int, int], list[CameraStep]] = {}
+    for camera in steps:
+        record = system.model.camera(camera.camera_idx)
+        if record.model.is_spherical or not camera.num_observations:
+            continue
+        by_size.setdefault((record.width, record.height), []).append(camera)
+        out += _of_images(system, camera.image_idxs, record, camera.camera_idx, camera.sd_focal_rel)
+    for cameras in by_size.values():
+        if len(cameras) > 1:
+            record = system.model.camera(cameras[0].camera_idx)
+            images = np.sort(np.concatenate([camera.image_idxs for camera in cameras]))
+            sd_focal_rel = float(np.median([camera.sd_focal_rel for camera in cameras]))
+            out += _of_images(system, images, record, None, sd_focal_rel)
+    return out
+
+
+def _missing_fields(system: JointSystem, image: int) -> ImageFields:
+    """Six columns, px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
+    camera, projected = system.observations.project(image)
+    fields = candidate_fields(camera, projected)
+    out = np.zeros((6, *fields.shape[1:]))
+    out[0, 0], out[1, 1] = 1.0, 1.0
+    out[2] = _next_radial(camera, projected)
+    out[3] = fields[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
+    out[4:] = fields[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
+    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, projected))
+
+
+def _shift_fields(system: JointSystem, image: int) -> ImageFields:
+    """The two columns of the principal point, px."""
+    shift = np.tile(np.eye(2), (system.observations.num_of(image), 1, 1))
+    return ImageFields(shift, system.observations.nuisance(image))
+
+
+def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
+    """(2, n) field of the first radial term that the model lacks."""
+    power = next((k for k, term in enumerate(_RADIAL) if term not in TERMS[camera.model.name]), len(_RADIAL)) + 1
+    focals = camera.model.focal_idxs
+    scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
+    return np.asarray(scale * projected.u * (projected.u**2).sum(axis=0) ** power)
+
+
+def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]:
+    terms = TERMS[camera.model.name]
+    missing = [k for k, term in enumerate(_RADIAL) if term not in terms]
+    out: list[tuple[Implied, tuple[str, ...], str]] = [(Implied.PRINCIPAL_POINT, ("cx", "cy"), "px")]
+    if missing:
+        out.append((Implied.RADIAL, (f"k{missing[0] + 1}",), "1"))
+    if Term.ASPECT not in terms:
+        out.append((Implied.ASPECT, ("fx / fy - 1",), "1"))
+    if Term.TANGENTIAL not in terms:
+        out.append((Implied.TANGENTIAL, ("p1", "p2"), "1"))
+    return out
+
+
+def _of_images(
+    system: JointSystem,
+    image_idxs: IntArray,
+    camera: CameraRecord,
+    camera_idx: int | None,
+    sd_focal_rel: float,
+) -> list[ImpliedParameter]:
+    images = image_idxs[np.diff(system.observations.offsets)[image_idxs] > 0]
+    fields_of = partial(_missing_fields if camera_idx is not None else _shift_fields, system)
+    scores = candidate_scores(system.base, images.tolist(), fields_of)
+    sigma_px = float(np.median(system.observations.sigma_px[images]))
+    out = []
+    for parameter, names, unit in _lacking(camera):
+        if camera_idx is None and parameter is not Implied.PRINCIPAL_POINT:
+            continue
+        step, sd, gain = _alone(scores, _COLUMNS[parameter])
+        known = sd_focal_rel <= MAX_SD_FOCAL_REL
+        large = np.abs(step) > MIN_SDS * sd
+        if parameter is Implied.PRINCIPAL_POINT:
+            large &= np.abs(step) > MIN_SHIFT_OVER_WIDTH * camera.width
+        px = sigma_px * math.sqrt(max(gain, 0.0) / scores.num_observations)
+        if parameter is not Implied.PRINCIPAL_POINT:
+            known = known and px > MIN_GAIN_PX
+        out.append(
+            ImpliedParameter(
+                parameter, camera_idx, images, names, unit, step, sd, sd_focal_rel, px, bool(known and large.any())
+            )
+        )
+    return out
+
+
+def _alone(scores: CandidateScores, own: slice) -> tuple[FloatArray, FloatArray, float]:
+    """Step K^+ u, its sd K^+ (sum G G^T) K^+, and the gain; NaN where base and points absorb a direction."""
+    scale = 1.0 / np.sqrt(scores.sq_length[own])
+    gram = scores.gram[own, own] * scale * scale[:, None]
+    if not np.isfinite(gram).all() or np.linalg.eigvalsh(gram)[0] <= _ABSORBED:
+        unknown = np.full(len(scale), np.nan)
+        return unknown, unknown, math.nan
+    inverse = np.linalg.inv(gram) * scale * scale[:, None]
+    step = inverse @ scores.score[own]
+    spread = scores.track_score[:, own] @ inverse
+    return step, np.sqrt((spread**2).sum(axis=0)), float(step @ scores.score[own])

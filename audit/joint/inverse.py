@@ -1,0 +1,219 @@
+"""S^+ without an eigendecomposition: gauge and other null directions deflated, one Cholesky factor (method.md 11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import lapack
+
+from loaders.arrays import BoolArray, FloatArray, IntArray
+
+NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal
+_DEAD: Final = 1e-12  # share of B's diagonal that the elimination of points leaves: below it, rounding
+_GAUGE_EIGENVALUE: Final = 1e-8  # a claimed direction of the gauge that costs more is none
+_SHIFT: Final = 1e-12
+_MAX_NULL: Final = 512
+_INVERSE_ITERATIONS: Final = 12
+_IN_NULL: Final = 1e-6  # squared length of a parameter in null directions from which on it is not identified
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointInverse:
+    """S^+ of the base system and, behind its D columns, of what was included since.
+
+    main: (D, D) of the base system alone; inclusion adds update update^T to it.
+    update: (D, k).    border: (D, m).    corner: (m, m).
+    unidentified: (D,) parameters without effect, or with a share in a null direction that is no gauge.
+    num_null: further null directions found.
+    """
+
+    main: FloatArray
+    update: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    unidentified: BoolArray
+    num_null: int
+
+    @property
+    def size(self) -> int:
+        """D + m."""
+        return len(self.main) + len(self.corner)
+
+    def block(self, support: IntArray) -> FloatArray:
+        """Return the entries at some sorted rows and the same columns."""
+        d = len(self.main)
+        base, extra = self._split(support)
+        k = base.size
+        out = np.empty((support.size, support.size))
+        out[:k, :k] = self.main if k == d else self.main[np.ix_(base, base)]
+        update = self.update[base]
+        out[:k, :k] += update @ update.T
+        out[:k, k:] = self.border[np.ix_(base, extra)]
+        out[k:, :k] = out[:k, k:].T
+        out[k:, k:] = self.corner[np.ix_(extra, extra)]
+        return out
+
+    def _split(self, support: IntArray) -> tuple[IntArray, IntArray]:
+        d = len(self.main)
+        k = int(np.searchsorted(support, d))
+        return support[:k], support[k:] - d
+
+    def times(self, support: IntArray, right: FloatArray) -> FloatArray:
+        """Return S^+ (all rows, at some sorted columns) @ right: (D + m, c) of (s, c)."""
+        base, extra = self._split(support)
+        head, tail = right[: base.size], right[base.size :]
+        main = self.main if base.size == len(self.main) else self.main[base].T
+        above = main @ head + self.update @ (self.update[base].T @ head) + self.border[:, extra] @ tail
+        below = self.border[base].T @ head + self.corner[:, extra] @ tail
+        return np.vstack([above, below])
+
+    def bordered(self, solution: FloatArray, schur_root: FloatArray) -> JointInverse:
+        """Return the inverse with n columns more.
+
+        Parameters
+        ----------
+        solution : (D + m, n) B = S^+ R of the new columns        schur_root : (n, r), K^+ = root root^T
+
+        Notes
+        -----
+        [[S^+ + B K^+ B^T, -B K^+], [-K^+ B^T, K^+]].
+        """
+        d = len(self.main)
+        moved = solution @ schur_root
+        head, tail = moved[:d], moved[d:]
+        border = np.hstack([self.border + head @ tail.T, -head @ schur_root.T])
+        cross = -tail @ schur_root.T
+        corner = np.block([[self.corner + tail @ tail.T, cross], [cross.T, schur_root @ schur_root.T]])
+        return replace(self, update=np.hstack([self.update, head]), border=border, corner=corner)
+
+
+def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArray) -> JointInverse:
+    """Invert S (D, D) off its null directions.
+
+    Parameters
+    ----------
+    before : (D,) diagonal of B        gauge : (D, g) directions that should be free
+
+    Notes
+    -----
+    In units in which S has unit diagonal: with G an orthonormal basis of the gauge, S + G G^T has S's other
+    eigenvectors and 1 on G, and its inverse minus G G^T is S^+. Null directions that are no gauge are looked for by
+    inverse iteration with the factor, and deflated in the same way.
+    """
+    diagonal = matrix.diagonal()
+    dead = diagonal <= _DEAD * before
+    scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
+    free = _orthonormal(gauge, scale, dead, matrix)
+    deflated, further = free, free[:, :0]
+    while True:
+        factor = _factor(matrix, scale, dead, deflated)
+        found = _null_directions(factor, deflated)
+        if not found.shape[1]:
+            break
+        further = np.hstack([further, found])
+        deflated = np.hstack([deflated, found])
+        if further.shape[1] >= _MAX_NULL:
+            break
+    inverse, _ = lapack.dpotri(factor.array, lower=1, overwrite_c=1)
+    _finish(inverse, deflated, scale, dead)
+    lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
+    size = len(scale)
+    nothing = np.zeros((size, 0))
+    return JointInverse(inverse.T, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Factor:
+    """Lower Cholesky factor (D, D) of S + Z Z^T + shift I, unit diagonal of S."""
+
+    array: FloatArray
+    shift: float
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """(D, c)."""
+        out, _ = lapack.dpotrs(self.array, right, lower=1)
+        return np.asarray(out)
+
+
+def _dense(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> FloatArray:
+    """S with unit diagonal plus Z Z^T; 1 on the diagonal of dead columns. In Fortran order, for LAPACK."""
+    out = matrix.toarray(order="F")
+    out /= scale[:, None]
+    out /= scale
+    if dead.any():
+        out[dead] = 0.0
+        out[:, dead] = 0.0
+        out[dead, dead] = 1.0
+    if deflated.shape[1]:
+        _add_outer(out, deflated, 1.0)
+    return np.asarray(out)
+
+
+def _add_outer(out: FloatArray, columns: FloatArray, sign: float) -> None:
+    """Add sign Z Z^T in place, some columns at a time."""
+    for start in range(0, len(out), 1024):
+        part = slice(start, start + 1024)
+        out[:, part] += sign * (columns @ columns[part].T)
+
+
+def _factor(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> _Factor:
+    shift = 0.0
+    while True:
+        array = _dense(matrix, scale, dead, deflated)
+        if shift:
+            array[np.diag_indices(len(array))] += shift
+        factor, info = lapack.dpotrf(array, lower=1, overwrite_a=1, clean=0)
+        if info == 0:
+            return _Factor(factor, shift)
+        shift = max(_SHIFT, 10.0 * shift)
+
+
+def _orthonormal(gauge: FloatArray, scale: FloatArray, dead: BoolArray, matrix: sparse.csr_array) -> FloatArray:
+    """(D, g') orthonormal basis, in scaled units, of those directions of the gauge that S leaves free."""
+    if not gauge.shape[1]:
+        return gauge
+    columns = gauge * scale[:, None]
+    columns[dead] = 0.0
+    columns = columns / np.maximum(np.sqrt((columns**2).sum(axis=0)), 1e-300)
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    left = left[:, singular > 1e-9 * singular.max(initial=0.0)]
+    cost = left.T @ ((matrix @ (left / scale[:, None])) / scale[:, None])
+    values, vectors = np.linalg.eigh(0.5 * (cost + cost.T))
+    return np.asarray(left @ vectors[:, values < _GAUGE_EIGENVALUE])
+
+
+def _null_directions(factor: _Factor, deflated: FloatArray) -> FloatArray:
+    """(D, k) orthonormal directions with an eigenvalue below the threshold, by block inverse iteration."""
+    size = len(factor.array)
+    rng = np.random.default_rng(0)
+    count = min(8, size)
+    while True:
+        block = np.linalg.qr(rng.normal(size=(size, count)))[0]
+        for _ in range(_INVERSE_ITERATIONS):
+            solved = factor.solve(block)
+            block = np.linalg.qr(solved - deflated @ (deflated.T @ solved))[0]
+        values, vectors = np.linalg.eigh(block.T @ factor.solve(block))
+        null = 1.0 / np.maximum(values, 1e-300) - factor.shift < NULL_EIGENVALUE
+        if not null.all() or count >= min(size, _MAX_NULL):
+            return np.asarray(block @ vectors[:, null])
+        count = min(size, 4 * count)
+
+
+def _finish(inverse: FloatArray, deflated: FloatArray, scale: FloatArray, dead: BoolArray) -> None:
+    """From the lower triangle of the scaled, deflated inverse to S^+, in place."""
+    size = len(inverse)
+    for start in range(0, size, 512):
+        stop = min(start + 512, size)
+        square = inverse[start:stop, start:stop]
+        square[...] = np.tril(square) + np.tril(square, -1).T
+        inverse[start:stop, stop:] = inverse[stop:, start:stop].T
+    if deflated.shape[1]:
+        _add_outer(inverse, deflated, -1.0)
+    inverse /= scale[:, None]
+    inverse /= scale
+    if dead.any():
+        inverse[dead] = 0.0
+        inverse[:, dead] = 0.0

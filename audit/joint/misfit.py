@@ -1,0 +1,225 @@
+"""Which images have a camera that is wrong in its form? Joint tests with sequential inclusion (method.md 11b)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from audit.joint.group_test import GroupTest, JointStatus, group_root, test_group, untested
+from audit.joint.inclusion import Candidate, include
+from audit.joint.system import JointSystem
+from audit.joint.worth import NO_WORTH, Worth, worth_of
+from audit.misfit.fields import GROUP_COLUMNS, GROUPS, MisfitGroup, candidate_fields
+from audit.multiplicity import benjamini_hochberg, holm
+from loaders.arrays import BoolArray, FloatArray
+
+MAX_ROUNDS: Final = 8
+_INCLUDE_FROM_PX: Final = 0.1
+_SHARE_OF_LARGEST: Final = 0.5
+
+
+class JointTest(NamedTuple):
+    """What (8) says of one group in one image, at the time when it counts.
+
+    q: of Holm over groups and Benjamini-Hochberg over the images that were tested in the same round.
+    p, q, px: NaN unless tested.    rank: r, None where unknown.
+    gain: |z|^2 - tr M in units of the noise.    worth: what admitting the group would do to the image.
+    """
+
+    p: float
+    q: float
+    px: float
+    rank: int | None
+    status: JointStatus
+    gain: float
+    worth: Worth
+
+    def bic(self, num_observations: int) -> float:
+        """Return |z|^2 - tr M + r - r log 2n; -inf unless tested."""
+        if self.status is not JointStatus.TESTED or self.rank is None:
+            return -math.inf
+        return self.gain + self.rank - self.rank * math.log(2 * num_observations)
+
+
+JointTests = dict[MisfitGroup, JointTest]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointMisfit:
+    """Misfit of all images of a model, nobody blamed for another.
+
+    tests: per image; of an included one those with which it was included.
+    effect_px: (I,) largest effect among significant groups, 0 without any, NaN where nothing was tested.
+    included: (I,) images whose fields became free parameters of the base.    round_included: (I,) -1 = never.
+    cause: per image, None without significant groups.
+    most_are_wrong: more than half of the tested images end with an effect above tau: rather their common camera.
+    """
+
+    tests: tuple[JointTests, ...]
+    effect_px: FloatArray
+    included: BoolArray
+    round_included: tuple[int, ...]
+    cause: tuple[MisfitGroup | None, ...]
+    most_are_wrong: bool
+
+
+def joint_misfit(
+    system: JointSystem, *, alpha: float, tau_px: FloatArray, excluded: BoolArray | None = None
+) -> JointMisfit:
+    """Test all images against everything that was or could be fitted, and free the fields of those that fail.
+
+    Parameters
+    ----------
+    tau_px : (I,) materiality, px; NaN where unknown counts as never material
+    excluded : (I,) images that are wrong in another way (pose, own parameters). They keep their free pose and own
+        parameters, so that they pull at nobody, but are neither tested nor counted. Ignored if they are more than
+        half of the images with columns: then it is not they that are wrong.
+
+    Notes
+    -----
+    H0 per image and group: the scores of E~ have mean zero; tracks are independent, nothing else is assumed of the
+    noise. Blind to what base and points absorb (eigenvalues of K below 1e-4).
+
+    *Inclusion:* images with q < alpha, an effect > min(0.1 px, tau / 2) and >= half of the largest get the group
+    with the largest effect as parameters of their own; at most 8 rounds; not if more than half of the tested images
+    would then be included. An included image keeps its tests and is no hypothesis any more. Only images that share
+    points with an included one are tested again: what an included field did to others it did through shared points.
+    """
+    has_columns = system.observations.layout.has_columns
+    left_out = np.zeros_like(has_columns) if excluded is None else excluded & has_columns
+    if 2 * np.count_nonzero(left_out) > np.count_nonzero(has_columns):
+        left_out = np.zeros_like(has_columns)
+    rounds = _Rounds(system, has_columns & ~left_out, alpha=alpha, tau_px=tau_px)
+    rounds.tests = [_nothing(has_columns[i], left_out[i]) for i in range(len(has_columns))]
+    return rounds.run()
+
+
+def _nothing(has_columns: bool, left_out: bool) -> dict[MisfitGroup, GroupTest]:
+    status = JointStatus.EXCLUDED if has_columns and left_out else JointStatus.NO_COLUMNS
+    return dict.fromkeys(GROUPS, untested(status))
+
+
+class _Rounds:
+    """Where inclusion stands."""
+
+    def __init__(self, system: JointSystem, tested: BoolArray, *, alpha: float, tau_px: FloatArray) -> None:
+        num_images = len(tested)
+        self._system, self._base = system, system.base
+        self._tested, self._alpha = tested, alpha
+        self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
+        self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
+        self.tests: list[dict[MisfitGroup, GroupTest]] = []
+        self._worth: list[dict[MisfitGroup, Worth]] = [{} for _ in range(num_images)]
+        self._q = np.full((num_images, len(GROUPS)), np.nan)
+        self._round = np.full(num_images, -1)
+
+    def run(self) -> JointMisfit:
+        """Test, include, test again."""
+        self._test(self._tested)
+        num_tested = np.count_nonzero(self._tested)
+        for number in range(MAX_ROUNDS):
+            waiting = np.where(self._round < 0, self._effects(), 0.0)
+            new = (waiting > self._include_from) & (waiting >= _SHARE_OF_LARGEST * waiting.max(initial=0.0))
+            if not new.any() or 2 * np.count_nonzero(new | (self._round >= 0)) > num_tested:
+                break
+            self._include(new)
+            self._round[new] = number
+            self._test(self._touched(new) & self._tested & (self._round < 0))
+        return self._result(bool(2 * np.count_nonzero(self._effects() > self._tau_px) > num_tested))
+
+    def _test(self, chosen: BoolArray) -> None:
+        for image in np.flatnonzero(chosen).tolist():
+            scores = self._scores(image)
+            self.tests[image], self._worth[image] = _image_tests(self._system, image, scores, self._alpha)
+        waiting = np.flatnonzero(self._tested & (self._round < 0))
+        p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()])
+        self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
+
+    def _scores(self, image: int) -> CandidateScores | None:
+        fields = _fields_of(self._system, image)
+        usable = bool(fields.fields.size)
+        return candidate_scores(self._base, [image], lambda _: fields) if usable else None
+
+    def _significant(self, image: int) -> list[MisfitGroup]:
+        return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
+
+    def _effects(self) -> FloatArray:
+        """(I,) largest effect among significant groups."""
+        return np.array(
+            [
+                max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
+                for i in range(len(self.tests))
+            ]
+        )
+
+    def _include(self, new: BoolArray) -> None:
+        candidates = []
+        for image in np.flatnonzero(new).tolist():
+            group = max(self._significant(image), key=lambda g: self.tests[image][g].px)
+            scores = self._scores(image)
+            if scores is not None:
+                own = GROUP_COLUMNS[group]
+                root = group_root(scores, own)
+                fields = _fields_of(self._system, image)
+                candidates.append(Candidate(image, ImageFields(fields.fields[:, :, own] @ root.T, fields.nuisance)))
+        self._base = include(self._base, candidates)
+
+    def _touched(self, new: BoolArray) -> BoolArray:
+        """(I,) images that share points with any of the new ones."""
+        observations = self._system.observations
+        shown = np.zeros(observations.num_points, dtype=bool)
+        shown[observations.point_idx[new[observations.image_idx]]] = True
+        out = np.zeros_like(new)
+        out[observations.image_idx[shown[observations.point_idx]]] = True
+        return out
+
+    def _result(self, most: bool) -> JointMisfit:
+        tests: list[JointTests] = []
+        causes: list[MisfitGroup | None] = []
+        for image, own in enumerate(self.tests):
+            q = self._q[image].tolist()
+            worth = self._worth[image]
+            joint = {
+                group: JointTest(t.p, q[k], t.px, t.rank, t.status, t.gain, worth.get(group, NO_WORTH))
+                for k, (group, t) in enumerate(own.items())
+            }
+            tests.append(joint)
+            causes.append(self._cause(image, joint))
+        effect = np.where(self._tested, self._effects(), np.nan)
+        return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
+
+    def _cause(self, image: int, tests: JointTests) -> MisfitGroup | None:
+        significant = self._significant(image)
+        material = [group for group in significant if tests[group].px > self._tau_px[image]]
+        n = self._system.observations.num_of(image)
+        return max(material or significant, key=lambda group: tests[group].bic(n), default=None)
+
+
+def _fields_of(system: JointSystem, image: int) -> ImageFields:
+    """42 candidate fields of an image, px per unit; none of panoramas."""
+    camera, projected = system.observations.project(image)
+    fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
+    return ImageFields(fields, system.observations.nuisance(image, projected))
+
+
+def _image_tests(
+    system: JointSystem, image: int, scores: CandidateScores | None, alpha: float
+) -> tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]:
+    """Tests of all groups, and the worth of those that may be significant."""
+    if scores is None:
+        return dict.fromkeys(GROUPS, untested(JointStatus.NO_FIELDS)), {}
+    observations = system.observations
+    sigma_px, rms_px = float(observations.sigma_px[image]), float(observations.rms_px[image])
+    with np.errstate(over="ignore", invalid="ignore"):
+        meat = scores.track_score.T @ scores.track_score
+    tests, worth = {}, {}
+    for group, own in GROUP_COLUMNS.items():
+        root = group_root(scores, own)
+        tests[group] = test_group(scores, meat, own, root, sigma_px=sigma_px, rms_px=rms_px)
+        if tests[group].p < alpha:
+            worth[group] = worth_of(system, image, scores, own, root)
+    return tests, worth

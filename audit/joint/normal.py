@@ -1,0 +1,178 @@
+"""The normal equations without the points: S and g (method.md (6))."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from audit.joint.neighbourhood import neighbourhood, sum_by_track
+from audit.joint.observations import JointObservations, point_information
+from loaders.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReducedSystem:
+    """S step = g over the D columns of the layout.
+
+    point_inverse: (P, 3, 3) V^-1; zero without observations, and where points are independent.
+    matrix: (D, D) S.    right: (D,) g.    before: (D,) diagonal of B, what S had without the elimination of points.
+    """
+
+    point_inverse: FloatArray
+    matrix: sparse.csr_array
+    right: FloatArray
+    before: FloatArray
+
+
+def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
+    """Assemble (6) with the robust weights and with w = 1; fills ``observations.crossed``."""
+    weights = observations.weight, observations.plain_weight
+    inverses = [_point_inverse(observations, weight) for weight in weights]
+    values_px = observations.residuals_px()
+    cleaned = [off_points(observations, *pair, values_px) for pair in zip(weights, inverses, strict=True)]
+    layout = observations.layout
+    right, before = np.zeros((2, layout.num_columns + 1)), np.zeros((2, layout.num_columns + 1))
+    blocks = _Blocks(layout.num_columns), _Blocks(layout.num_columns)
+    for image in observations.used_images:
+        rows, columns = observations.rows(image), layout.columns[image]
+        own = observations.nuisance(image)
+        jacobian = observations.jacobian(image) * observations.weight[rows, None, None]
+        np.matmul(jacobian.transpose(0, 2, 1), own, out=observations.crossed[rows])
+        for k, weight in enumerate(weights):
+            weighted = (own * weight[rows, None, None]).reshape(-1, layout.width)
+            gram = weighted.T @ own.reshape(-1, layout.width)
+            np.add.at(right[k], columns, cleaned[k][rows].reshape(-1) @ weighted)
+            np.add.at(before[k], columns, gram.diagonal())
+            blocks[k].add(columns, columns[None], gram[None])
+    if not observations.points_independent:
+        _eliminate_points(observations, inverses, blocks)
+    robust, plain = (
+        ReducedSystem(inverses[k], blocks[k].matrix(), right[k, :-1], before[k, :-1]) for k in range(len(weights))
+    )
+    return robust, plain
+
+
+def _eliminate_points(
+    observations: JointObservations, inverses: list[FloatArray], blocks: tuple[_Blocks, _Blocks]
+) -> None:
+    """Subtract sum W V^-1 W^T, image by image; only images that share points with it have an entry."""
+    layout = observations.layout
+    to_plain = observations.plain_weight / observations.weight
+    for image in observations.used_images:
+        rows = observations.rows(image)
+        points, track = np.unique(observations.point_idx[rows], return_inverse=True)
+        around = neighbourhood(observations, points)
+        crossed = observations.crossed[around.views]
+        own = observations.crossed[rows]
+        columns, others = layout.columns[image], layout.columns[around.images]
+        for k, inverse in enumerate(inverses):
+            if k == 1:
+                crossed *= to_plain[around.views, None, None]
+                own = own * to_plain[rows, None, None]
+            eliminated = inverse[points] @ sum_by_track(own, track, points.size)  # V^-1 W^T
+            slab = around.gather(crossed, eliminated)
+            blocks[k].add(columns, others, -slab.transpose(0, 2, 1))
+
+
+def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr_array:
+    """Return M (D, D): sum over tracks of g_t g_t^T, with g_t the score of the base system from track t.
+
+    Parameters
+    ----------
+    score : (n, C) w N^T y~, with y~ the residuals after the step; they are off J, so g_t is its sum over the views
+    """
+    layout = observations.layout
+    blocks = _Blocks(layout.num_columns)
+    for image in observations.used_images:
+        rows = observations.rows(image)
+        points, track = np.unique(observations.point_idx[rows], return_inverse=True)
+        around = neighbourhood(observations, points)
+        own = sum_by_track(score[rows], track, points.size)
+        slab = around.gather(score[around.views, None, :], own[:, None, :])
+        blocks.add(layout.columns[image], layout.columns[around.images], slab.transpose(0, 2, 1))
+    return blocks.matrix()
+
+
+def off_points(
+    observations: JointObservations, weight: FloatArray, point_inverse: FloatArray, values_px: FloatArray
+) -> FloatArray:
+    """Return values (n, 2) minus what moving the points alone would remove: J V^-1 J^T w."""
+    if observations.points_independent:
+        return values_px
+    step = point_steps(observations, weight, point_inverse, values_px)
+    jacobian, source = observations.residuals.point_jacobian, observations.source
+    out = values_px.copy()
+    for i in range(3):
+        moved = step[observations.point_idx, i]
+        out[:, 0] -= jacobian[0, i].take(source) * moved
+        out[:, 1] -= jacobian[1, i].take(source) * moved
+    return out
+
+
+def point_steps(
+    observations: JointObservations, weight: FloatArray, point_inverse: FloatArray, values_px: FloatArray
+) -> FloatArray:
+    """Return (P, 3): where values (n, 2) pull the points, V^-1 J^T w, world frame."""
+    jacobian, source = observations.residuals.point_jacobian, observations.source
+    pull = np.empty((observations.num_points, 3))
+    for i in range(3):
+        along = jacobian[0, i].take(source) * values_px[:, 0] + jacobian[1, i].take(source) * values_px[:, 1]
+        pull[:, i] = np.bincount(observations.point_idx, along * weight, observations.num_points)
+    return np.asarray(np.einsum("pij,pj->pi", point_inverse, pull))
+
+
+def _point_inverse(observations: JointObservations, weight: FloatArray) -> FloatArray:
+    if observations.points_independent:
+        return np.zeros((observations.num_points, 3, 3))
+    everywhere = np.zeros(observations.residuals.point_idx.size)
+    everywhere[observations.source] = weight
+    information = point_information(
+        observations.residuals.point_jacobian, everywhere, observations.residuals.point_idx, observations.num_points
+    )
+    seen = np.flatnonzero(np.diff(observations.point_offsets) > 0)
+    scale = np.sqrt(np.einsum("pii->pi", information[seen]))
+    unit = information[seen] / scale[:, :, None] / scale[:, None, :]
+    out = np.zeros_like(information)
+    out[seen] = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
+    return out
+
+
+class _Blocks:
+    """A sparse symmetric matrix, collected block by block; the column behind the last one is padding."""
+
+    def __init__(self, num_columns: int) -> None:
+        self._num_columns = num_columns
+        self._rows: list[IntArray] = []
+        self._columns: list[IntArray] = []
+        self._values: list[FloatArray] = []
+        self._sum: sparse.csr_array | None = None
+        self._pending = 0
+
+    def add(self, rows: IntArray, columns: IntArray, blocks: FloatArray) -> None:
+        """Add blocks (m, r, c) at rows (r,) and columns (m, c)."""
+        row = np.broadcast_to(rows[None, :, None], blocks.shape)
+        column = np.broadcast_to(columns[:, None, :], blocks.shape)
+        real = (row < self._num_columns) & (column < self._num_columns)
+        self._rows.append(row[real].astype(np.int32))
+        self._columns.append(column[real].astype(np.int32))
+        self._values.append(blocks[real])
+        self._pending += self._values[-1].size
+        if self._pending > 4_000_000:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._pending:
+            return
+        shape = (self._num_columns, self._num_columns)
+        index = (np.concatenate(self._rows), np.concatenate(self._columns))
+        part = sparse.coo_array((np.concatenate(self._values), index), shape=shape).tocsr()
+        self._sum = part if self._sum is None else self._sum + part
+        self._rows, self._columns, self._values, self._pending = [], [], [], 0
+
+    def matrix(self) -> sparse.csr_array:
+        """The sum of all blocks."""
+        self._flush()
+        shape = (self._num_columns, self._num_columns)
+        return sparse.csr_array(shape) if self._sum is None else self._sum

@@ -1,0 +1,196 @@
+"""The observations that enter the joint system, with their Jacobians and weights (method.md section 11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from audit.joint.layout import NUM_POSE, Layout, make_layout
+from audit.misfit.nuisance import ProjectedImage, project_image
+from audit.residuals import ModelResiduals
+from loaders.arrays import BoolArray, FloatArray, IntArray
+from loaders.model import CameraRecord, SparseModel
+
+MIN_INLIERS: Final = 20
+_HUBER: Final = 2.5  # sigma from which on an observation loses weight
+_SINGULAR_POINT: Final = 1e-9  # determinant of V with unit diagonal
+_MIN_VIEWS: Final = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointObservations:
+    """The n observations of the system by image, in the order of ModelResiduals; C = ``layout.width``.
+
+    model, residuals: where they come from.
+    offsets: (I + 1,) image i owns rows offsets[i]:offsets[i + 1].    source: (n,) columns of ModelResiduals.
+    image_idx: (n,).    point_idx: (n,) rows of PointTable; of an independent point, the observation itself.
+    crossed: (n, 3, C) w J^T N, what (6) sums to W^T; N itself is cheap to make again, see `nuisance`.
+    weight: (n,) w / s^2 with w = min(1, 2.5 s / |eps|); plain_weight: (n,) 1 / s^2.    1 / px^2.
+    sigma_px: (I,) s.    rms_px: (I,) of all inliers.
+    by_point: (n,) rows by point, then in order; point_offsets: (P + 1,) point p owns by_point[o[p]:o[p + 1]].
+    points_independent: whether points are known from elsewhere, so that nothing is eliminated.
+    """
+
+    model: SparseModel
+    residuals: ModelResiduals
+    layout: Layout
+    offsets: IntArray
+    source: IntArray
+    image_idx: IntArray
+    point_idx: IntArray
+    crossed: FloatArray
+    weight: FloatArray
+    plain_weight: FloatArray
+    sigma_px: FloatArray
+    rms_px: FloatArray
+    by_point: IntArray
+    point_offsets: IntArray
+    points_independent: bool
+
+    @property
+    def num_points(self) -> int:
+        """Rows of per-point arrays, points without observations included."""
+        return len(self.point_offsets) - 1
+
+    @property
+    def used_images(self) -> list[int]:
+        """Images with columns and observations."""
+        return np.flatnonzero(self.layout.has_columns & (np.diff(self.offsets) > 0)).tolist()
+
+    def rows(self, image_idx: int) -> slice:
+        """Observations of an image."""
+        return slice(int(self.offsets[image_idx]), int(self.offsets[image_idx + 1]))
+
+    def num_of(self, image_idx: int) -> int:
+        """How many observations an image has."""
+        return int(self.offsets[image_idx + 1] - self.offsets[image_idx])
+
+    def residuals_px(self) -> FloatArray:
+        """(n, 2) observed minus projected."""
+        return np.ascontiguousarray(self.residuals.residuals_px.take(self.source, axis=1).T)
+
+    def jacobian(self, image_idx: int) -> FloatArray:
+        """J (n_i, 2, 3) of an image, px per model unit, world frame."""
+        source = self.source[self.rows(image_idx)]
+        return np.ascontiguousarray(self.residuals.point_jacobian.take(source, axis=2).transpose(2, 0, 1))
+
+    def project(self, image_idx: int) -> tuple[CameraRecord, ProjectedImage]:
+        """Camera of an image with columns and the projections of the points that it sees in the system."""
+        image = self.model.image(image_idx)
+        if image.camera is None:
+            raise ValueError(f"image {image.image_id} has columns but no camera")
+        points = self.residuals.point_idx[self.source[self.rows(image_idx)]]
+        return image.camera, project_image(image.camera, image.cam_from_world(self.model.points.xyz_world[points]))
+
+    def nuisance(self, image_idx: int, projected: ProjectedImage | None = None) -> FloatArray:
+        """N (n_i, 2, C) of an image, px per unit of its columns; zero in padding and where it is not finite."""
+        projected = self.project(image_idx)[1] if projected is None else projected
+        out = np.zeros((self.num_of(image_idx), 2, self.layout.width))
+        out[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0)
+        if self.layout.has_rigs:
+            out[:, :, :NUM_POSE] = out[:, :, :NUM_POSE] @ self.layout.image_from_frame[image_idx]
+        params = list(self.layout.own_param_idxs[int(self.layout.camera_idx[image_idx])])
+        if params:
+            out[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
+        else:  # at the poles of a panorama a column may not be finite: no effect there
+            out[~np.isfinite(out)] = 0.0
+        return out
+
+
+def joint_observations(
+    model: SparseModel,
+    residuals: ModelResiduals,
+    sigma_px: FloatArray,
+    *,
+    left_out: BoolArray | None = None,
+    frame_idx: IntArray | None = None,
+    image_from_frame: FloatArray | None = None,
+    points_independent: bool = False,
+) -> JointObservations:
+    """Choose the observations and differentiate them.
+
+    Images with fewer than 20 inliers, unknown or zero noise, or derivatives that are not finite have no columns, and
+    their observations are left out of everything; so are those of ``left_out`` (I,). Points with fewer than two
+    views left or with a singular V (two rays that are parallel) are left out with their observations.
+    """
+    counts = np.diff(residuals.offsets)
+    known = np.isfinite(sigma_px) & (sigma_px > 0)
+    used = (counts >= MIN_INLIERS) & known & (model.images.camera_idx >= 0)
+    used &= ~left_out if left_out is not None else True
+    used &= _finite_images(residuals)
+    weight, plain = _weights(residuals, np.where(used, sigma_px, np.nan), counts)
+    in_use = np.repeat(used, counts)
+    if not points_independent:
+        in_use &= _regular_points(residuals, np.where(in_use, weight, 0.0), len(model.points))[residuals.point_idx]
+    layout = make_layout(model, used, frame_idx, image_from_frame)
+    source = np.flatnonzero(in_use)
+    image_idx = np.repeat(np.arange(len(counts)), counts)[source]
+    offsets = np.searchsorted(image_idx, np.arange(len(counts) + 1)).astype(np.int64)
+    point_idx = np.arange(source.size) if points_independent else residuals.point_idx[source]
+    num_points = source.size if points_independent else len(model.points)
+    by_point = np.argsort(point_idx, kind="stable").astype(np.int64)
+    point_offsets = np.concatenate([[0], np.cumsum(np.bincount(point_idx, minlength=num_points))]).astype(np.int64)
+    return JointObservations(
+        model,
+        residuals,
+        layout,
+        offsets,
+        source,
+        image_idx,
+        point_idx,
+        np.zeros((source.size, 3, layout.width)),
+        weight[source],
+        plain[source],
+        sigma_px,
+        _rms_px(residuals, counts),
+        by_point,
+        point_offsets,
+        points_independent,
+    )
+
+
+def _finite_images(residuals: ModelResiduals) -> BoolArray:
+    """(I,) images whose derivatives in the points are all finite."""
+    bad = ~np.isfinite(residuals.point_jacobian.sum(axis=(0, 1)))
+    sums = np.concatenate([[0], np.cumsum(bad)])
+    return np.asarray(sums[residuals.offsets[1:]] == sums[residuals.offsets[:-1]])
+
+
+def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return w / s^2 and 1 / s^2 of all inliers; NaN without noise."""
+    sigma = np.repeat(sigma_px, counts)
+    length = np.sqrt((residuals.residuals_px**2).sum(axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        robust = np.minimum(1.0, _HUBER * sigma / length)
+    robust[length == 0] = 1.0
+    plain = 1.0 / sigma**2
+    return robust * plain, plain
+
+
+def _rms_px(residuals: ModelResiduals, counts: IntArray) -> FloatArray:
+    """(I,) root mean square length of all inliers' residuals, NaN without any."""
+    sums = np.concatenate([[0.0], np.cumsum((residuals.residuals_px**2).sum(axis=0))])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(np.diff(sums[residuals.offsets]) / counts)
+
+
+def _regular_points(residuals: ModelResiduals, weight: FloatArray, num_points: int) -> BoolArray:
+    """(P,) points with two views or more whose V can be inverted."""
+    information = point_information(residuals.point_jacobian, weight, residuals.point_idx, num_points)
+    views = np.bincount(residuals.point_idx[weight > 0], minlength=num_points)
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), 1e-300))
+    unit = information / scale[:, :, None] / scale[:, None, :]
+    return np.asarray((views >= _MIN_VIEWS) & (np.linalg.det(unit) > _SINGULAR_POINT))
+
+
+def point_information(jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
+    """Return V (P, 3, 3) of (6): sum of w J^T J over a point's views, of J (2, 3, n)."""
+    out = np.empty((num_points, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            product = (jacobian[0, i] * jacobian[0, j] + jacobian[1, i] * jacobian[1, j]) * weight
+            product[weight == 0] = 0.0
+            out[:, i, j] = out[:, j, i] = np.bincount(point_idx, product, num_points)
+    return out

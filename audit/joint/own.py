@@ -1,0 +1,172 @@
+"""Do the cameras' own parameters sit at their optimum, and how well are they known? (method.md section 11)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from audit.joint.layout import NUM_POSE
+from audit.joint.system import JointSystem
+from loaders.arrays import FloatArray, IntArray
+
+MIN_SDS: Final = 5.0
+_CURVED: Final = 0.01  # relative step of a focal length from which on its second order matters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraStep:
+    """What adjusting everything would do to one camera's own parameters.
+
+    camera_idx: row of CameraTable.    image_idxs: its images in the system.    num_observations: theirs.
+    names: (q,) own parameters.    stored, step, sd: (q,) in their units. sd: sandwich clustered by track,
+    NaN where the parameter is not identified.
+    implied: (q,) the values that the step speaks for: stored + step, but see `_implied_focal`.
+    plain_step: (q,) with w = 1: what a least-squares adjuster would do. Nothing should be rejected unless both agree.
+    own_step_px: what freeing these parameters alone would gain, RMS px; plain_step_px: the same of ``plain_step``.
+    sd_focal_rel: largest sd_f / |f|, NaN where a focal length is not identified or there is none.
+    focal_identified: whether all focal lengths are.
+    """
+
+    camera_idx: int
+    image_idxs: IntArray
+    num_observations: int
+    names: tuple[str, ...]
+    stored: FloatArray
+    step: FloatArray
+    sd: FloatArray
+    plain_step: FloatArray
+    own_step_px: float
+    plain_step_px: float
+    sd_focal_rel: float
+    focal_identified: bool
+    implied: FloatArray
+
+    def is_material(self, tau_px: float, min_sds: float = MIN_SDS) -> bool:
+        """Whether both steps gain more than tau and a parameter moves by more than ``min_sds`` sd in both."""
+        gain_px = min(self.own_step_px, self.plain_step_px)
+        return bool(gain_px > tau_px and (np.abs(self.agreed) > min_sds * self.sd).any())
+
+    @property
+    def agreed(self) -> FloatArray:
+        """(q,) the smaller of the two steps where they agree in sign, else 0."""
+        smaller = np.minimum(np.abs(self.step), np.abs(self.plain_step))
+        return np.where(self.step * self.plain_step > 0, np.copysign(smaller, self.step), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """What freeing the pose alone, the camera alone, or both would gain, in units of the noise squared."""
+
+    pose: float
+    camera: float
+    both: float
+
+
+def own_parameters(system: JointSystem) -> tuple[CameraStep, ...]:
+    """Return the steps of all cameras that have images in the system.
+
+    Notes
+    -----
+    own_step_px = s sqrt(step^T [(S^+)_own]^-1 step / n) in the base system: points, poses and all other cameras
+    profiled; s the median sigma and n the observations of the camera's images.
+    """
+    layout = system.observations.layout
+    cameras = np.unique(layout.camera_idx[layout.has_columns]).tolist()
+    covariances = system.covariances([layout.own_of_camera(camera) for camera in cameras])
+    return tuple(_camera_step(system, camera, own) for camera, own in zip(cameras, covariances, strict=True))
+
+
+def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -> CameraStep:
+    observations, layout = system.observations, system.observations.layout
+    camera = system.model.camera(camera_idx)
+    columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
+    images = layout.images_of_camera(camera_idx)
+    n = int(np.diff(observations.offsets)[images].sum())
+    sigma_px = float(np.median(observations.sigma_px[images]))
+    step, plain = system.base.step[columns], system.plain_step[columns]
+    sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    focal = np.array([sd[params.index(i)] / abs(camera.params[i]) for i in camera.model.focal_idxs])
+    px = [sigma_px * math.sqrt(wald(system, columns, value) / n) if n else math.nan for value in (step, plain)]
+    return CameraStep(
+        camera_idx,
+        images,
+        n,
+        tuple(camera.model.param_names[i] for i in params),
+        camera.params[params],
+        step,
+        sd,
+        plain,
+        px[0],
+        px[1],
+        float(focal.max()) if focal.size else math.nan,
+        bool(np.isfinite(focal).all()),
+        _implied(
+            system, images, camera.params[params] + step, [params.index(i) for i in camera.model.focal_idxs], step
+        ),
+    )
+
+
+def _implied(
+    system: JointSystem, images: IntArray, values: FloatArray, focals: list[int], step: FloatArray
+) -> FloatArray:
+    """Implied values, (q,); focal lengths that move by more than a percent are corrected for the step's curvature."""
+    out = values.copy()
+    stored = values - step
+    large = [k for k in focals if abs(step[k]) > _CURVED * abs(stored[k])]
+    if not large:
+        return out
+    relief = float(np.median([system.relief_change(image) for image in images.tolist()]))
+    for k in large:
+        out[k] = _implied_focal(float(stored[k]), float(step[k]), relief)
+    return out
+
+
+def _implied_focal(stored: float, step: float, relief: float) -> float:
+    """Return f' of a step that changed depth over relief by ``relief`` (relative).
+
+    f / (Z + d) for points with relief d: the linear step says 1 + a - b Z / (Z + d) of it, a = step / f, the truth is
+    (1 + a') / (1 + b' Z / (Z + d)). Equal for all d if 1 + a' = s^2 / (s - b), s = 1 + a - b. Poses that followed a
+    wrong focal length (8 % too long: linear -8.0 %) come back at once (-7.4 %); where they did not, b = 0.
+    """
+    scale = 1.0 + step / stored - relief
+    if not (scale > 0 and scale - relief > _CURVED):
+        return stored + step
+    return stored * scale * scale / (scale - relief)
+
+
+def wald(system: JointSystem, columns: IntArray, step: FloatArray) -> float:
+    """Return step^T [(S^+)_bb]^-1 step at some columns b; unidentified directions gain nothing."""
+    block = system.base.inverse.main[np.ix_(columns, columns)]
+    diagonal = block.diagonal()
+    used = (diagonal > 0) & ~system.base.inverse.unidentified[columns]
+    if not used.any():
+        return 0.0
+    scale = np.sqrt(diagonal[used])
+    values, vectors = np.linalg.eigh(block[np.ix_(used, used)] / scale / scale[:, None])
+    kept = values > 1e-12
+    along = vectors[:, kept].T @ (step[used] / scale)
+    return float((along**2 / values[kept]).sum())
+
+
+def image_gains(system: JointSystem, image_idx: int) -> Gains:
+    """Return what freeing an image's pose alone, its camera's own parameters alone, or both would gain.
+
+    Notes
+    -----
+    Everything else is free. step_b^T [(S^+)_bb]^-1 step_b of the camera is what it gains *beside* a free pose, so the
+    pose alone gains the rest of both, and the other way round: a focal length that nobody adjusted to gains
+    everything alone, and next to nothing beside a pose that makes up for it.
+    """
+    layout = system.observations.layout
+    if not layout.has_columns[image_idx]:
+        return Gains(math.nan, math.nan, math.nan)
+    columns = layout.columns[image_idx]
+    columns = columns[columns < layout.num_columns]
+    step = system.base.step[columns]
+    both = wald(system, columns, step)
+    beside_camera = wald(system, columns[:NUM_POSE], step[:NUM_POSE])
+    beside_pose = wald(system, columns[NUM_POSE:], step[NUM_POSE:])
+    return Gains(pose=both - beside_pose, camera=both - beside_camera, both=both)

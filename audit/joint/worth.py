@@ -1,0 +1,65 @@
+"""What is a misfit worth? The pose and focal length of the image if the group were admitted (section 11)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from audit.joint.candidates import CandidateScores
+from audit.joint.layout import NUM_POSE
+from audit.joint.system import JointSystem
+from loaders.arrays import FloatArray
+
+
+class Worth(NamedTuple):
+    """Changes of one image: rotation (degrees), centre (share of the median depth), focal length (share of f).
+
+    rotation_deg, centre_rel >= 0; focal_rel is the largest relative change, with its sign. NaN where unknown.
+    """
+
+    rotation_deg: float
+    centre_rel: float
+    focal_rel: float
+
+
+NO_WORTH = Worth(math.nan, math.nan, math.nan)
+
+
+def worth_of(system: JointSystem, image_idx: int, scores: CandidateScores, own: slice, root: FloatArray) -> Worth:
+    """Return by how much the base moves an image when a group of its fields is admitted.
+
+    Parameters
+    ----------
+    root : L of `audit.joint.group_test.group_root`
+
+    Notes
+    -----
+    theta = K^+ u; the base moves by -B theta, the gauge projected out, so that a change is one against the rest of
+    the model. C = -R^T t, and a left perturbation (w, t) moves it by -R^T t: |dC| = |t|.
+    """
+    layout = system.observations.layout
+    theta = root.T @ (root @ scores.score[own])
+    columns = layout.columns[image_idx]
+    columns = columns[columns < layout.num_columns]
+    at = np.searchsorted(scores.support, columns)
+    present = (at < scores.support.size) & (scores.support[np.minimum(at, scores.support.size - 1)] == columns)
+    if not present.all():
+        return NO_WORTH
+    change = -scores.solution[at, own] @ theta
+    pose = layout.image_from_frame[image_idx] @ change[:NUM_POSE]
+    depth = system.median_depth(image_idx)
+    return Worth(
+        math.degrees(float(np.sqrt(pose[:3] @ pose[:3]))),
+        float(np.sqrt(pose[3:] @ pose[3:])) / depth,
+        _focal_change(system, image_idx, change[NUM_POSE:]),
+    )
+
+
+def _focal_change(system: JointSystem, image_idx: int, change: FloatArray) -> float:
+    camera_idx = int(system.observations.layout.camera_idx[image_idx])
+    camera = system.model.camera(camera_idx)
+    own = system.observations.layout.own_param_idxs[camera_idx]
+    relative = [float(change[own.index(i)] / camera.params[i]) for i in camera.model.focal_idxs]
+    return max(relative, key=abs, default=math.nan)
