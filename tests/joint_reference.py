@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from audit.engine import ModelAuditor
-from audit.joint import joint_system
-from audit.misfit.nuisance import fitted_param_idxs, project_image
-from audit.simulate.adjust import adjust_scene, sparse_model, true_claim
-from audit.simulate.noise import NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders.model import SparseModel
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.joint import joint_system
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, project_image
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders.model import SparseModel
 
 SPEC = SceneSpec(
     num_images=7, points_per_image=90, noise=NoiseSpec(sigma_px=0.5), min_track_length=3, max_track_length=6

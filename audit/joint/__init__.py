@@ -1,14 +1,13 @@
 """What would adjusting everything do, and what is left that nothing could take up? (method.md sections 11 and 11b)."""
 
-from audit.joint.audit import JointAudit, audit_jointly
-from audit.joint.blocks import covisible_blocks
-from audit.joint.group_test import JointStatus
-from audit.joint.implied import Implied, ImpliedParameter, implied_parameters
-from audit.joint.layout import image_from_frame
-from audit.joint.misfit import JointMisfit, JointTest, JointTests, joint_misfit
-from audit.joint.own import CameraStep, Gains, image_gains, own_parameters
-from audit.joint.system import JointSystem, joint_system
-from audit.joint.worth import Worth
+from sfm_audit.audit.joint.audit import JointAudit, audit_jointly
+from sfm_audit.audit.joint.blocks import covisible_blocks
+from sfm_audit.audit.joint.implied import Implied, ImpliedParameter, implied_parameters
+from sfm_audit.audit.joint.layout import image_from_frame
+from sfm_audit.audit.joint.misfit import JointMisfit, JointTest, JointTests, joint_misfit
+from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from sfm_audit.audit.joint.system import JointSystem, joint_system
+from sfm_audit.audit.joint.worth import Worth
 
 __all__ = [
     "CameraStep",
@@ -17,7 +16,6 @@ __all__ = [
     "ImpliedParameter",
     "JointAudit",
     "JointMisfit",
-    "JointStatus",
     "JointSystem",
     "JointTest",
     "JointTests",

@@ -8,14 +8,14 @@ from typing import Final
 
 import numpy as np
 
-from audit.joint.blocks import Block, covisible_blocks
-from audit.joint.implied import ImpliedParameter, implied_parameters
-from audit.joint.misfit import JointMisfit, joint_misfit
-from audit.joint.own import CameraStep, Gains, image_gains, own_parameters
-from audit.joint.system import JointSystem, joint_system
-from audit.residuals import ModelResiduals
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import SparseModel
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.blocks import Block, covisible_blocks
+from sfm_audit.audit.joint.implied import ImpliedParameter, implied_parameters
+from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
+from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from sfm_audit.audit.joint.system import JointSystem, joint_system
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
 
 MAX_COLUMNS: Final = 10_000
 """Of one dense factor: 800 MB."""

@@ -8,11 +8,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from audit.joint.layout import NUM_POSE
-from audit.misfit.nuisance import fitted_param_idxs
-from audit.residuals import ModelResiduals
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import SparseModel
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
 
 _CORE_SHARE = 0.5  # of a block's columns; the rest are the neighbours that its images hang on
 

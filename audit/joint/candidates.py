@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
-from audit.joint.system import Base, IncludedFields
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
+from sfm_audit.audit.joint.system import Base, IncludedFields
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,10 +6,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from audit.joint.layout import NUM_POSE, cross_matrix
-from audit.joint.observations import JointObservations
-from loaders.arrays import FloatArray, IntArray
-from loaders.model import SparseModel
+from sfm_audit.audit.joint.layout import NUM_POSE, cross_matrix
+from sfm_audit.audit.joint.observations import JointObservations
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
 
 NUM_GAUGE = 7
 

@@ -3,41 +3,19 @@
 from __future__ import annotations
 
 import math
-from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
 
-from audit.joint.candidates import CandidateScores
-from loaders.arrays import FloatArray
+from sfm_audit.audit.joint.candidates import CandidateScores
+from sfm_audit.audit.table.words import MisfitStatus
+from sfm_audit.loaders.arrays import FloatArray
 
 KEPT_EIGENVALUE: Final = 1e-4  # of K with unit columns: below it, base and points absorb the direction
 MIN_OBSERVATIONS_PER_RANK: Final = 4
 MAX_EFFECT_OVER_RMS: Final = 1.5  # method.md section 10d (b)
 _SINGULAR_MEAT: Final = 1e-12
-
-
-class JointStatus(StrEnum):
-    """Why a group has a joint effect, or why not.
-
-    TESTED: p, px and rank are there.        ABSORBED: base and points span the group.
-    NOT_ENOUGH_EVIDENCE: fewer than 4 observations or tracks per rank.
-    SINGULAR: the scores do not vary.        NOT_FINITE: a derivative is not finite.
-    NO_FIELDS: spherical cameras.            NO_COLUMNS: the image takes no part in the joint system.
-    EXCLUDED: the image's pose or camera is wrong otherwise; its fields are not asked for.
-    NOT_ESTIMABLE: the effect exceeds 1.5 times the image's rms_px: a numerical fault, no verdict (section 10d).
-    """
-
-    TESTED = "tested"
-    ABSORBED = "absorbed"
-    NOT_ENOUGH_EVIDENCE = "not_enough_evidence"
-    SINGULAR = "singular"
-    NOT_FINITE = "not_finite"
-    NO_FIELDS = "no_fields"
-    NO_COLUMNS = "no_columns"
-    EXCLUDED = "excluded"
-    NOT_ESTIMABLE = "not_estimable"
 
 
 class GroupTest(NamedTuple):
@@ -47,10 +25,10 @@ class GroupTest(NamedTuple):
     px: float
     gain: float
     rank: int | None
-    status: JointStatus
+    status: MisfitStatus
 
 
-def untested(status: JointStatus, rank: int | None = None) -> GroupTest:
+def untested(status: MisfitStatus, rank: int | None = None) -> GroupTest:
     """Return a test without p and px."""
     return GroupTest(math.nan, math.nan, math.nan, rank, status)
 
@@ -77,26 +55,26 @@ def test_group(
     meat : (c, c) sum over tracks of G G^T, of all candidates        root : L of `group_root`
     """
     if not np.isfinite(scores.gram[own, own]).all():
-        return untested(JointStatus.NOT_FINITE)
+        return untested(MisfitStatus.NOT_FINITE)
     rank, n = len(root), scores.num_observations
     if rank == 0:
-        return untested(JointStatus.ABSORBED, 0)
+        return untested(MisfitStatus.ABSORBED, 0)
     clusters = min(len(scores.track_score), n)
     if min(n, clusters) < MIN_OBSERVATIONS_PER_RANK * rank:
-        return untested(JointStatus.NOT_ENOUGH_EVIDENCE, rank)
+        return untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank)
     z = root @ scores.score[own]
     spread = root @ meat[own, own] @ root.T
     statistic = _quadratic_form(z, spread)
     if math.isnan(statistic):
-        return untested(JointStatus.SINGULAR, rank)
+        return untested(MisfitStatus.SINGULAR, rank)
     # (T / r)(c - r) / c / (1 - T / c) ~ F(r, c - r) is T / c ~ Beta: its upper tail loses no digits
     left = max(1.0 - statistic / clusters, 0.0)
     p = float(special.betainc(0.5 * (clusters - rank), 0.5 * rank, left))
     gain = float(z @ z - np.trace(spread))
     px = sigma_px * math.sqrt(max(0.0, gain) / n)
     if px > MAX_EFFECT_OVER_RMS * rms_px:
-        return untested(JointStatus.NOT_ESTIMABLE, rank)
-    return GroupTest(p, px, gain, rank, JointStatus.TESTED)
+        return untested(MisfitStatus.NOT_ESTIMABLE, rank)
+    return GroupTest(p, px, gain, rank, MisfitStatus.TESTED)
 
 
 def _quadratic_form(z: FloatArray, spread: FloatArray) -> float:

@@ -10,14 +10,16 @@ from typing import Final
 
 import numpy as np
 
-from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
-from audit.joint.own import CameraStep
-from audit.joint.system import JointSystem
-from audit.misfit.capabilities import TERMS, Term
-from audit.misfit.fields import GROUP_COLUMNS, MisfitGroup, candidate_fields
-from audit.misfit.nuisance import ProjectedImage
-from loaders.arrays import FloatArray, IntArray
-from loaders.model import CameraRecord
+from sfm_audit.audit.cameras.functions import Term
+from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.own import CameraStep
+from sfm_audit.audit.joint.system import JointSystem
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
+from sfm_audit.audit.misfit.nuisance import ProjectedImage
+from sfm_audit.audit.table.words import MisfitGroup
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord
 
 MAX_SD_FOCAL_REL: Final = 0.003
 MIN_SDS: Final = 5.0
@@ -110,14 +112,16 @@ def _shift_fields(system: JointSystem, image: int) -> ImageFields:
 
 def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
     """(2, n) field of the first radial term that the model lacks."""
-    power = next((k for k, term in enumerate(_RADIAL) if term not in TERMS[camera.model.name]), len(_RADIAL)) + 1
+    power = (
+        next((k for k, term in enumerate(_RADIAL) if term not in functions_of(camera.model).terms), len(_RADIAL)) + 1
+    )
     focals = camera.model.focal_idxs
     scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
     return np.asarray(scale * projected.u * (projected.u**2).sum(axis=0) ** power)
 
 
 def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]:
-    terms = TERMS[camera.model.name]
+    terms = functions_of(camera.model).terms
     missing = [k for k, term in enumerate(_RADIAL) if term not in terms]
     out: list[tuple[Implied, tuple[str, ...], str]] = [(Implied.PRINCIPAL_POINT, ("cx", "cy"), "px")]
     if missing:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
-from audit.joint.group_test import KEPT_EIGENVALUE
-from audit.joint.system import Base, IncludedFields, with_step
-from loaders.arrays import FloatArray
+from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE
+from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
+from sfm_audit.loaders.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

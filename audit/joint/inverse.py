@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal
 _DEAD: Final = 1e-12  # share of B's diagonal that the elimination of points leaves: below it, rounding

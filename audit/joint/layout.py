@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.misfit.nuisance import fitted_param_idxs
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import SparseModel
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
 
 NUM_POSE: Final = 6
 

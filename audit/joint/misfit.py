@@ -8,14 +8,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
-from audit.joint.group_test import GroupTest, JointStatus, group_root, test_group, untested
-from audit.joint.inclusion import Candidate, include
-from audit.joint.system import JointSystem
-from audit.joint.worth import NO_WORTH, Worth, worth_of
-from audit.misfit.fields import GROUP_COLUMNS, GROUPS, MisfitGroup, candidate_fields
-from audit.multiplicity import benjamini_hochberg, holm
-from loaders.arrays import BoolArray, FloatArray
+from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
+from sfm_audit.audit.joint.inclusion import Candidate, include
+from sfm_audit.audit.joint.system import JointSystem
+from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
+from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
 
 MAX_ROUNDS: Final = 8
 _INCLUDE_FROM_PX: Final = 0.1
@@ -34,13 +35,13 @@ class JointTest(NamedTuple):
     q: float
     px: float
     rank: int | None
-    status: JointStatus
+    status: MisfitStatus
     gain: float
     worth: Worth
 
     def bic(self, num_observations: int) -> float:
         """Return |z|^2 - tr M + r - r log 2n; -inf unless tested."""
-        if self.status is not JointStatus.TESTED or self.rank is None:
+        if self.status is not MisfitStatus.TESTED or self.rank is None:
             return -math.inf
         return self.gain + self.rank - self.rank * math.log(2 * num_observations)
 
@@ -99,7 +100,7 @@ def joint_misfit(
 
 
 def _nothing(has_columns: bool, left_out: bool) -> dict[MisfitGroup, GroupTest]:
-    status = JointStatus.EXCLUDED if has_columns and left_out else JointStatus.NO_COLUMNS
+    status = MisfitStatus.EXCLUDED if has_columns and left_out else MisfitStatus.NO_COLUMNS
     return dict.fromkeys(GROUPS, untested(status))
 
 
@@ -211,7 +212,7 @@ def _image_tests(
 ) -> tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]:
     """Tests of all groups, and the worth of those that may be significant."""
     if scores is None:
-        return dict.fromkeys(GROUPS, untested(JointStatus.NO_FIELDS)), {}
+        return dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS)), {}
     observations = system.observations
     sigma_px, rms_px = float(observations.sigma_px[image]), float(observations.rms_px[image])
     with np.errstate(over="ignore", invalid="ignore"):

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from scipy import sparse
 
-from audit.joint.observations import JointObservations
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.joint.observations import JointObservations
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _VIEWS_AT_ONCE: Final = 200_000
 

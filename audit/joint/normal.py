@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from audit.joint.neighbourhood import neighbourhood, sum_by_track
-from audit.joint.observations import JointObservations, point_information
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.joint.neighbourhood import neighbourhood, sum_by_track
+from sfm_audit.audit.joint.observations import JointObservations, point_information
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

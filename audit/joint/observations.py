@@ -7,11 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from audit.joint.layout import NUM_POSE, Layout, make_layout
-from audit.misfit.nuisance import ProjectedImage, project_image
-from audit.residuals import ModelResiduals
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import CameraRecord, SparseModel
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
+from sfm_audit.audit.misfit.nuisance import ProjectedImage, project_image
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, SparseModel
 
 MIN_INLIERS: Final = 20
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from audit.joint.layout import NUM_POSE
-from audit.joint.system import JointSystem
-from loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.system import JointSystem
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 MIN_SDS: Final = 5.0
 _CURVED: Final = 0.01  # relative step of a focal length from which on its second order matters

@@ -11,14 +11,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from audit.joint.gauge import gauge_directions
-from audit.joint.inverse import JointInverse, joint_inverse
-from audit.joint.layout import NUM_POSE
-from audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
-from audit.joint.observations import JointObservations, joint_observations
-from audit.residuals import ModelResiduals
-from loaders.arrays import BoolArray, FloatArray, IntArray
-from loaders.model import SparseModel
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.gauge import gauge_directions
+from sfm_audit.audit.joint.inverse import JointInverse, joint_inverse
+from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
+from sfm_audit.audit.joint.observations import JointObservations, joint_observations
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
 
 _DIRECT: Final = 1500  # columns up to which the plain step gets a factor of its own
 _COLUMNS_AT_ONCE: Final = 400
@@ -99,7 +99,7 @@ class JointSystem:
     def image_covariances(self, image_idxs: Sequence[int]) -> list[FloatArray]:
         """Return (6 + q, 6 + q) each: sandwich covariance S^+ M S^+ of an image's pose and own parameters.
 
-        In the order of `audit.identifiability.fitted_names`, NaN in the rows of parameters that are not identified and
+        In the order of `audit.camera_quality.identifiability.fitted_names`, NaN in the rows of parameters that are not identified and
         for images without columns. The pose is relative to the whole model: the gauge is projected out.
 
         Of what was tried this predicts the true error of real models best (356 healthy images with ground truth: rank

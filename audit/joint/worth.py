@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from audit.joint.candidates import CandidateScores
-from audit.joint.layout import NUM_POSE
-from audit.joint.system import JointSystem
-from loaders.arrays import FloatArray
+from sfm_audit.audit.joint.candidates import CandidateScores
+from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.system import JointSystem
+from sfm_audit.loaders.arrays import FloatArray
 
 
 class Worth(NamedTuple):

@@ -102,7 +102,9 @@ class MisfitStatus(StrEnum):
     NOT_ENOUGH_EVIDENCE: fewer than 4 observations (pooled: tracks) per rank, or fewer values than parameters.
     SINGULAR: the scores do not vary in every direction of the group, for instance because all residuals are zero.
     NOT_FINITE: a derivative is not finite.        NO_FIELDS: spherical cameras.
-    NOT_ESTIMABLE: the effect is larger than the residuals it was taken from can hold.
+    NOT_ESTIMABLE: the effect is larger than the residuals it was taken from can hold: a numerical fault, no verdict.
+    NO_COLUMNS: the image takes no part in the joint system (too few inliers, unknown noise, parts that disagree).
+    EXCLUDED: the image's pose or camera is wrong otherwise; its fields are not asked for.
     """
 
     TESTED = "tested"
@@ -112,6 +114,8 @@ class MisfitStatus(StrEnum):
     NOT_FINITE = "derivatives not finite"
     NO_FIELDS = "spherical camera"
     NOT_ESTIMABLE = "effect not estimable"
+    NO_COLUMNS = "not in the joint system"
+    EXCLUDED = "pose or camera wrong otherwise"
 
 
 class Severity(StrEnum):

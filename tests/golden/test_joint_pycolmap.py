@@ -11,14 +11,14 @@ import pytest
 from joint_reference import model_of, system_of, with_param
 from numpy.testing import assert_allclose
 
-from audit.engine import ModelAuditor
-from audit.joint import implied_parameters, joint_misfit, joint_system, own_parameters
-from audit.simulate.adjust import adjust_scene, sparse_model
-from audit.simulate.colmap_files import write_colmap_binary
-from audit.simulate.defects import DefectKind, DefectSpec
-from audit.simulate.noise import NoiseSpec
-from audit.simulate.scene import SceneSpec, simulate_scene
-from loaders import open_model
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.joint import implied_parameters, joint_misfit, joint_system, own_parameters
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
+from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.loaders import open_model
 
 SPEC = SceneSpec(num_images=12, points_per_image=250, noise=NoiseSpec(sigma_px=0.5))
 

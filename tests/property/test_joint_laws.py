@@ -12,9 +12,9 @@ from joint_reference import SPEC, model_of, system_of, with_poses
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from audit.joint import image_gains, implied_parameters, joint_misfit, own_parameters
-from audit.misfit.fields import GROUPS
-from loaders.model import ImageTable, ObservationTable
+from sfm_audit.audit.joint import image_gains, implied_parameters, joint_misfit, own_parameters
+from sfm_audit.audit.table.words import GROUPS
+from sfm_audit.loaders.model import ImageTable, ObservationTable
 
 seeds = st.integers(0, 3)
 TAU_PX = np.full(SPEC.num_images, 0.2)

@@ -9,9 +9,10 @@ import pytest
 from joint_reference import SPEC, model_of, with_param
 from numpy.testing import assert_allclose
 
-from audit.engine import ModelAuditor
-from audit.joint import JointStatus, audit_jointly, covisible_blocks
-from audit.joint.own import _implied_focal
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.joint import audit_jointly, covisible_blocks
+from sfm_audit.audit.joint.own import _implied_focal
+from sfm_audit.audit.table.words import MisfitStatus
 
 CHAIN = dataclasses.replace(SPEC, num_images=30, points_per_image=150, max_neighbours=6)
 
@@ -67,7 +68,7 @@ def test_a_frozen_focal_length_is_named_with_its_value_and_its_image_alone_is_ex
     assert found.steps[5].names == ("f", "k")
     assert_allclose(found.steps[5].implied[0], stored, atol=5 * found.steps[5].sd[0])
     assert np.flatnonzero(found.excluded).tolist() == [5]
-    assert {test.status for test in found.misfit.tests[5].values()} == {JointStatus.EXCLUDED}
+    assert {test.status for test in found.misfit.tests[5].values()} == {MisfitStatus.EXCLUDED}
     assert not (found.misfit.effect_px > 0.2).any()
 
 

@@ -11,14 +11,15 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from audit.engine import ModelAuditor
-from audit.joint import JointStatus, image_from_frame, image_gains, joint_misfit, joint_system, own_parameters
-from audit.joint.candidates import ImageFields, candidate_scores
-from audit.joint.group_test import group_root
-from audit.joint.group_test import test_group as judge_group
-from audit.joint.inclusion import Candidate, include
-from audit.joint.inverse import joint_inverse
-from audit.misfit.fields import GROUP_COLUMNS, GROUPS, MisfitGroup, candidate_fields
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.joint import image_from_frame, image_gains, joint_misfit, joint_system, own_parameters
+from sfm_audit.audit.joint.candidates import ImageFields, candidate_scores
+from sfm_audit.audit.joint.group_test import group_root
+from sfm_audit.audit.joint.group_test import test_group as judge_group
+from sfm_audit.audit.joint.inclusion import Candidate, include
+from sfm_audit.audit.joint.inverse import joint_inverse
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 
 NAMES = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE")
 
@@ -139,8 +140,8 @@ def test_the_test_is_hotelling_s(system):
     n = system.observations.num_of(0)
     assert found.px == pytest.approx(0.7 * np.sqrt(max(0.0, z @ z - np.sum(g**2)) / n), rel=1e-9)
     scores = dataclasses.replace(scores, score=3.0 * scores.score)
-    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1.0).status is JointStatus.TESTED
-    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1e-3).status is JointStatus.NOT_ESTIMABLE
+    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1.0).status is MisfitStatus.TESTED
+    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1e-3).status is MisfitStatus.NOT_ESTIMABLE
 
 
 def test_inclusion_is_the_same_as_columns_more(system, reference):
@@ -269,8 +270,8 @@ def test_images_that_cannot_take_part_have_no_columns():
     assert np.flatnonzero(~system.observations.layout.has_columns).tolist() == [2, 4]
     assert not np.isin(system.observations.image_idx, [2, 4]).any()
     found = joint_misfit(system, alpha=0.05, tau_px=np.full(7, 0.2), excluded=np.arange(7) == 5)
-    assert {t.status for t in found.tests[4].values()} == {JointStatus.NO_COLUMNS}
-    assert {t.status for t in found.tests[5].values()} == {JointStatus.EXCLUDED}
+    assert {t.status for t in found.tests[4].values()} == {MisfitStatus.NO_COLUMNS}
+    assert {t.status for t in found.tests[5].values()} == {MisfitStatus.EXCLUDED}
     assert np.flatnonzero(np.isnan(found.effect_px)).tolist() == [2, 4, 5]
     covariances = system.image_covariances([0, 2])
     assert covariances[0].shape == (8, 8)
