@@ -30,7 +30,7 @@ class AuditConfig(BaseModel):
         "(independent: nothing to undo, nobody to blame; takes noise = constant)",
     )
     policy: PolicyName = Field(
-        default="full",
+        default="standard",
         description="which verdicts decide: standard = misfit, camera, pose, plausible, noise, outside; camera = the "
         "first four; full = all; paper = verdict_ks",
     )
@@ -42,6 +42,9 @@ class AuditConfig(BaseModel):
     alpha: float = Field(default=thresholds.ALPHA.default, gt=0, lt=1, description=thresholds.ALPHA.meaning)
     min_ks_distance: float = Field(
         default=thresholds.MIN_KS_DISTANCE.default, ge=0, lt=1, description=thresholds.MIN_KS_DISTANCE.meaning
+    )
+    max_noise_distance: float = Field(
+        default=thresholds.MAX_NOISE_DISTANCE.default, ge=0, lt=1, description=thresholds.MAX_NOISE_DISTANCE.meaning
     )
     min_observations: int = Field(
         default=int(thresholds.MIN_OBSERVATIONS.default), ge=2, description=thresholds.MIN_OBSERVATIONS.meaning

@@ -45,6 +45,16 @@ class FindingCode(StrEnum):
     EXACT_PROJECTIONS = "exact_projections"
     POINTS_NOT_OPTIMAL = "points_not_optimal"
     TRACK_STATISTICS_FROM_ALL_IMAGES = "track_statistics_from_all_images"
+    PARTS_DISAGREE = "parts_disagree"
+    POINTS_BEHIND = "points_behind"
+    IMAGES_DISAGREE = "images_disagree"
+    PIXEL_CONVENTION = "pixel_convention"
+    IMPLIED_PRINCIPAL_POINT = "implied_principal_point"
+    IMPLIED_RADIAL = "implied_radial"
+    IMPLIED_ASPECT = "implied_aspect"
+    IMPLIED_TANGENTIAL = "implied_tangential"
+    JOINT_IN_BLOCKS = "joint_in_blocks"
+    NOISE_PRIOR_NOT_CONVERGED = "noise_prior_not_converged"
 
 
 FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
@@ -73,6 +83,16 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.UNTERMINATED_TEXT: "a text file does not end its last line: its last number may be cut",
     FindingCode.EXACT_PROJECTIONS: "images whose 2D points are projections of the 3D points, not measurements",
     FindingCode.POINTS_NOT_OPTIMAL: "moving the 3D points alone would remove much of the residuals (removable_share)",
+    FindingCode.PARTS_DISAGREE: "cameras, poses, points and 2D points do not belong together; no lens is diagnosed",
+    FindingCode.POINTS_BEHIND: "all observations lie behind their cameras: axes flipped, or poses inverted?",
+    FindingCode.IMAGES_DISAGREE: "images whose camera, pose, points and 2D points do not belong together",
+    FindingCode.PIXEL_CONVENTION: "all observations are shifted by half a pixel: another convention of pixel centres",
+    FindingCode.IMPLIED_PRINCIPAL_POINT: "adjusting the principal point, which nobody freed, would move it by so much",
+    FindingCode.IMPLIED_RADIAL: "the next radial coefficient, which the camera model lacks, would be so large",
+    FindingCode.IMPLIED_ASPECT: "fx / fy, which the camera model takes as 1, would be so much",
+    FindingCode.IMPLIED_TANGENTIAL: "p1 and p2, which the camera model lacks, would be so large",
+    FindingCode.JOINT_IN_BLOCKS: "the model is too large for one joint system; it was solved in blocks of covisibility",
+    FindingCode.NOISE_PRIOR_NOT_CONVERGED: "the prior of the track noise did not converge: KS rests on what it reached",
     FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES: "too many images are away from their optimum to leave them out",
 }
 """One line per finding, for docs/findings.md."""

@@ -44,12 +44,16 @@ class CameraShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraQuality:
-    """What one image says of its camera; misfit as the model stands, expected_error_px median over the image."""
+    """What one image says of its camera, the points taken as given.
+
+    misfit: as the model stands.    expected_error_px: median over the image.    median_depth: model units.
+    """
 
     shape: CameraShape
     misfit: MisfitTests
     identifiability: Identifiability
     expected_error_px: float
+    median_depth: float
     coverage: float
     occupied_cells: int
 
@@ -92,6 +96,7 @@ def camera_quality(
         prepared.test(residuals_px),
         known,
         error,
+        depth,
         coverage(xy_px, camera.width, camera.height),
         occupied_cells(xy_px, camera.width, camera.height, grid),
     )

@@ -6,10 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.camera import judge_camera, pose_alone
 from sfm_audit.audit.decision.diagnostics import Diagnostics
-from sfm_audit.audit.decision.members import Judgement, judge_ks, judge_misfit, judge_plausible, judge_pose
+from sfm_audit.audit.decision.members import (
+    Judgement,
+    judge_ks,
+    judge_misfit,
+    judge_noise,
+    judge_plausible,
+    judge_pose,
+)
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
-from sfm_audit.audit.table.words import POLICIES, Member, PolicyName, Reason, Verdict, strongest
+from sfm_audit.audit.decision.severity import severity_of
+from sfm_audit.audit.table.words import POLICIES, Member, PolicyName, Reason, ReasonCode, Severity, Verdict, strongest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,11 +27,15 @@ class Decision:
 
     members: each question's judgement; a question that was not asked is missing.
     judgement: of the policy, with the reasons of its members.    misfit: None where nothing was tested.
+    severity: of the members' rejections; None where no member rejects.    pose_first: the pose explains what freeing
+    pose and camera would gain, so its reasons come before the camera's.
     """
 
     members: Mapping[Member, Judgement]
     judgement: Judgement
     misfit: MisfitDecision | None
+    severity: Severity | None = None
+    pose_first: bool = False
 
     @property
     def verdict(self) -> Verdict:
@@ -46,7 +59,7 @@ class Decision:
 
     def under(self, policy: PolicyName) -> Judgement:
         """Return the verdict of a policy with the reasons of its members."""
-        return judgement_under(self.members, policy)
+        return judgement_under(self.members, policy, pose_first=self.pose_first)
 
 
 def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
@@ -66,27 +79,47 @@ def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
     method.md section 7. Run, calibrate, explain, demo, and all that decide a finished run again call this.
     """
     found = _misfit(diagnostics, settings)
-    unusable = diagnostics.unusable
-    if unusable is not None:
-        asked = (Member.MISFIT, Member.POSE, Member.PLAUSIBLE, Member.KS)
-        members = {m: Judgement(Verdict.UNDETERMINED, (replace(unusable, member=m),)) for m in asked}
+    blocked = diagnostics.unusable or _all_behind(diagnostics)
+    if blocked is not None:
+        asked = [member for member in Member if member is not Member.OUTSIDE]
+        members: dict[Member, Judgement] = {
+            m: Judgement(Verdict.UNDETERMINED, (replace(blocked, member=m),)) for m in asked
+        }
     else:
+        camera = judge_camera(diagnostics, settings)
         members = {
             Member.MISFIT: judge_misfit(diagnostics, found, settings),
+            **({} if camera is None else {Member.CAMERA: camera}),
             Member.POSE: judge_pose(diagnostics, settings),
             Member.PLAUSIBLE: judge_plausible(diagnostics, settings),
+            Member.NOISE: judge_noise(diagnostics, settings),
             Member.KS: judge_ks(diagnostics, settings),
         }
-    return Decision(members, judgement_under(members, settings.policy), found)
+    pose_first = pose_alone(diagnostics.gains)
+    judgement = judgement_under(members, settings.policy, pose_first=pose_first)
+    severity = severity_of(members, found, diagnostics.misfit)
+    return Decision(members, judgement, found, severity, pose_first)
 
 
-def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName) -> Judgement:
+def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName, *, pose_first: bool = False) -> Judgement:
     """Return rejected if any member rejects, else undetermined if any is, else accepted; each reason once."""
-    deciding = [members[member] for member in POLICIES[policy] if member in members]
+    order = list(POLICIES[policy])
+    if pose_first and Member.POSE in order:
+        order.remove(Member.POSE)
+        order.insert(0, Member.POSE)
+    deciding = [members[member] for member in order if member in members]
     reasons: dict[str, Reason] = {}
     for reason in (reason for each in deciding for reason in each.reasons):
         reasons.setdefault(str(reason), reason)
     return Judgement(strongest(each.verdict for each in deciding), tuple(reasons.values()))
+
+
+def _all_behind(diagnostics: Diagnostics) -> Reason | None:
+    """Nothing can be projected, or hardly anything: the reason that stands in the way of every question."""
+    consistency = diagnostics.consistency
+    if consistency is None or not consistency.all_behind:
+        return None
+    return Reason(ReasonCode.POINTS_BEHIND, Member.CAMERA, consistency.text)
 
 
 def _misfit(diagnostics: Diagnostics, settings: AuditConfig) -> MisfitDecision | None:

@@ -31,17 +31,29 @@ class NoiseDiagnostics:
 
 
 @dataclass(frozen=True, slots=True)
+class Worth:
+    """Changes of an image if a misfit were admitted: degrees, share of the median depth, share of f; NaN unknown."""
+
+    rotation_deg: float
+    centre_rel: float
+    focal_rel: float
+
+
+@dataclass(frozen=True, slots=True)
 class GroupDiagnostics:
     """One misfit group of one image or camera.
 
     q: adjusted over groups, and over images or cameras; NaN unless tested.    px: RMS of the explained field.
     gain: BIC gain, by how much the group pays for its parameters; -inf unless tested.
+    worth: what admitting the group would do to the image; None where it is not known.
     """
 
     q: float
     px: float
     gain: float
     status: MisfitStatus
+    rank: int | None = None
+    worth: Worth | None = None
 
 
 def misfit_groups(
@@ -50,7 +62,11 @@ def misfit_groups(
     """Return the diagnostics of all groups; q is (6,) in the order of GROUPS, NaN where not tested."""
     return {
         group: GroupDiagnostics(
-            float(value), tests[group].px, bic(tests[group], num_observations, sigma_px), tests[group].status
+            float(value),
+            tests[group].px,
+            bic(tests[group], num_observations, sigma_px),
+            tests[group].status,
+            tests[group].rank,
         )
         for group, value in zip(GROUPS, q, strict=True)
     }
@@ -93,6 +109,7 @@ class CameraDiagnostics:
     focal_over_size: f / max(width, height).    principal_point_px: None where the camera has none (panoramas).
     sd_focal_rel, sd_k1: standard deviations, NaN where unknown.    singular_share: smallest / largest singular value of
     the parameters' columns, NaN where derivatives are not finite.    is_singular: some combination has no effect.
+    is_joint: whether the deviations are those of the joint system, or conditional on the points.
     """
 
     focal_over_size: float
@@ -108,6 +125,64 @@ class CameraDiagnostics:
     is_singular: bool
     k1: float | None
     sd_k1: float
+    is_joint: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ConsistencyDiagnostics:
+    """Do camera, pose, points and 2D points belong together? (method.md section 12).
+
+    inconsistent: None where too little is known.    text: what was found, and the cause.    rms_px: after the own
+    pose's step.    all_behind: all observations of the model lie behind their cameras.
+    """
+
+    inconsistent: bool | None
+    text: str
+    rms_px: float
+    all_behind: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class OwnStep:
+    """One own parameter: stored value, the value that the joint step implies, the step and its sd.
+
+    step: the smaller of the weighted and the unweighted one where they agree in sign, else 0.
+    """
+
+    name: str
+    stored: float
+    implied: float
+    step: float
+    sd: float
+
+
+@dataclass(frozen=True, slots=True)
+class OwnDiagnostics:
+    """The camera's own parameters in the joint system (method.md section 11).
+
+    step_px: what freeing them alone would gain, the smaller of weighted and unweighted.    sigma_px: of its images.
+    num_images: that share the camera.
+    """
+
+    step_px: float
+    sigma_px: float
+    num_images: int
+    steps: tuple[OwnStep, ...]
+
+    @property
+    def largest(self) -> OwnStep | None:
+        """The parameter whose step is most of its standard deviations; None without any that is known."""
+        known = [step for step in self.steps if step.sd > 0]
+        return max(known, key=lambda step: abs(step.step) / step.sd, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """What freeing the pose alone, the camera alone, or both would gain; NaN where unknown."""
+
+    pose: float
+    camera: float
+    both: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +192,7 @@ class Diagnostics:
     unusable: what makes it impossible to project any point.    num_inliers: observations behind all that follows.
     largest_residual_px, longer_side_px: 2D points whose residuals are rounding were not measured.
     misfit, camera: None without inliers.    remarks: reasons that decide nothing, found elsewhere.
+    consistency, own, gains: None where nobody asked; has_own: whether the camera has own parameters to ask for.
     """
 
     num_inliers: int
@@ -128,3 +204,7 @@ class Diagnostics:
     longer_side_px: int = 0
     unusable: Reason | None = None
     remarks: tuple[Reason, ...] = field(default=())
+    consistency: ConsistencyDiagnostics | None = None
+    own: OwnDiagnostics | None = None
+    has_own: bool = False
+    gains: Gains | None = None

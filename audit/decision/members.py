@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.diagnostics import CameraDiagnostics, Diagnostics
 from sfm_audit.audit.decision.misfit import MisfitDecision
-from sfm_audit.audit.table.thresholds import EXACT_SHARE
+from sfm_audit.audit.table.thresholds import EXACT_SHARE, KS_CRITICAL
 from sfm_audit.audit.table.words import MISFIT_CODES, Member, MisfitGroup, Reason, ReasonCode, Verdict
 
 
@@ -56,6 +56,20 @@ def judge_ks(diagnostics: Diagnostics, settings: AuditConfig) -> Judgement:
         return Judgement(
             Verdict.REJECTED, (Reason(ReasonCode.KS_REJECTED, Member.KS, text, noise.ks_p, settings.alpha, "1"),)
         )
+    return Judgement(Verdict.ACCEPTED)
+
+
+def judge_noise(diagnostics: Diagnostics, settings: AuditConfig) -> Judgement:
+    """Rejected when the distance from N(0, 1) exceeds its 5 % point by what can be seen (method.md sections 7, 10a)."""
+    noise, member = diagnostics.noise, Member.NOISE
+    unknown = _no_standardised(member, diagnostics, settings)
+    if unknown is not None:
+        return undetermined(unknown)
+    excess = noise.ks_stat - KS_CRITICAL / math.sqrt(2 * noise.num_standardised)
+    limit = settings.max_noise_distance
+    if excess > limit:
+        text = f"D - {KS_CRITICAL:g} / sqrt(N) = {excess:.3f} > {limit:g}, N = {2 * noise.num_standardised}"
+        return Judgement(Verdict.REJECTED, (Reason(ReasonCode.NOISE_DIFFERS, member, text, excess, limit, "1"),))
     return Judgement(Verdict.ACCEPTED)
 
 
@@ -114,6 +128,10 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
 
 
 def _not_tested(found: MisfitDecision) -> tuple[Reason, ...]:
+    statuses = {status for _, status in found.untested}
+    if len(found.untested) == len(MISFIT_CODES) and len(statuses) == 1:
+        text = f"all groups ({statuses.pop()})"
+        return (Reason(ReasonCode.MISFIT_NOT_TESTED, Member.MISFIT, text),)
     untested = [f"{group} ({status})" for group, status in found.untested]
     return (Reason(ReasonCode.MISFIT_NOT_TESTED, Member.MISFIT, ", ".join(untested)),) if untested else ()
 
@@ -209,13 +227,17 @@ def _focal_doubt(camera: CameraDiagnostics, num_inliers: int, settings: AuditCon
         text = f"{num_inliers} observations"
         return Reason(ReasonCode.NOISE_NOT_FITTED, member, text, num_inliers, None, "count")
     limit = settings.max_sd_focal_rel
-    text = f"sd_f / f = {sd:.2%} > {limit:.0%}, conditional on the points"
+    text = f"sd_f / f = {sd:.2%} > {limit:.2%}{_basis(camera)}"
     return Reason(ReasonCode.FOCAL_NOT_IDENTIFIED, member, text, sd, limit, "1")
+
+
+def _basis(camera: CameraDiagnostics) -> str:
+    return "" if camera.is_joint else ", conditional on the points"
 
 
 def _k1_remark(camera: CameraDiagnostics, settings: AuditConfig) -> list[Reason]:
     """That k1 is not identified, which decides nothing; an unknown deviation identifies nothing."""
     if camera.k1 is None or abs(camera.k1) >= settings.min_k1_sds * camera.sd_k1:
         return []
-    text = f"{camera.k1:.3g}, sd = {camera.sd_k1:.2g}, conditional on the points"
+    text = f"{camera.k1:.3g}, sd = {camera.sd_k1:.2g}{_basis(camera)}"
     return [Reason(ReasonCode.K1_NOT_IDENTIFIED, Member.PLAUSIBLE, text, camera.k1, camera.sd_k1, "1")]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_audit.audit.camera_quality.measure import CameraQuality
+from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
 from sfm_audit.audit.inliers.residuals import ModelResiduals
@@ -22,8 +23,9 @@ from sfm_audit.audit.misfit import (
     image_design,
     image_retest,
 )
-from sfm_audit.audit.misfit.peeling import Significance
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.misfit.significance import UNTESTED, Significance
+from sfm_audit.audit.table.words import Member, Verdict
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel
 
 
@@ -51,6 +53,10 @@ class _CameraImages:
     residuals: ModelResiduals
     camera: CameraRecord
     image_idxs: IntArray
+
+    def only(self, holds: BoolArray) -> _CameraImages:
+        """Return those of the images that hold (I,)."""
+        return replace(self, image_idxs=self.image_idxs[holds[self.image_idxs]])
 
     def tests(self, camera: CameraRecord, tracks: Sequence[IntArray], num_tracks: int) -> PooledTests:
         """Test as if the images had been taken with ``camera``."""
@@ -84,12 +90,14 @@ def audit_cameras(
     *,
     alpha: float,
     tau_px: FloatArray,
+    holds: BoolArray,
 ) -> list[CameraAudit]:
     """Audit every camera that has an image with inliers, in the order of the camera table.
 
     Parameters
     ----------
     quality : per image, None without inliers            sigma_px, tau_px : (I,) sigma_constant_px and materiality
+    holds : (I,) images whose pose and consistency hold; the others have no say (one bad pose in 24 makes a wrong lens)
 
     Notes
     -----
@@ -98,18 +106,12 @@ def audit_cameras(
     there but for points that the image sees twice. q: Benjamini-Hochberg over the model's cameras.
     """
     audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
-    cameras = np.unique(model.images.camera_idx[audited])
     groups = [
         _CameraImages(model, residuals, model.camera(int(c)), audited[model.images.camera_idx[audited] == c])
-        for c in cameras
+        for c in np.unique(model.images.camera_idx[audited])
     ]
     tracks = [group.tracks() for group in groups]
-    tests = [
-        own.misfit
-        if len(group.image_idxs) == 1 and (own := quality[int(group.image_idxs[0])]) is not None
-        else group.tests(group.camera, *track).tests
-        for group, track in zip(groups, tracks, strict=True)
-    ]
+    tests = [_pooled(group.only(holds), quality) for group in groups]
     significance = Significance.of(tests)
     out = []
     for k, (group, (rows, num_points)) in enumerate(zip(groups, tracks, strict=True)):
@@ -128,6 +130,16 @@ def audit_cameras(
         )
         out.append(CameraAudit(group.camera, group.image_idxs, num_points, num_observations, tests[k], misfit, advice))
     return out
+
+
+def _pooled(group: _CameraImages, quality: Sequence[CameraQuality | None]) -> MisfitTests:
+    """The tests of all images of a camera together; of the image alone where it has one."""
+    if not len(group.image_idxs):
+        return UNTESTED
+    own = quality[int(group.image_idxs[0])]
+    if len(group.image_idxs) == 1 and own is not None:
+        return own.misfit
+    return group.tests(group.camera, *group.tracks()).tests
 
 
 def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> Retest:
@@ -159,8 +171,16 @@ def _distortion_identified(quality: Sequence[CameraQuality | None], min_sds: flo
     return False
 
 
-def image_advice(quality: CameraQuality, misfit: MisfitDecision, retest: Retest, *, alpha: float) -> str | None:
-    """Return the camera model that one image asks for; ``retest`` of its points and residuals."""
+def image_advice(quality: CameraQuality, decision: Decision, retest: Retest, *, alpha: float) -> str | None:
+    """Return the camera model that one image asks for; ``retest`` of its points and residuals.
+
+    No lens is advised where the parts do not belong together, and no smaller one where any question rejects or the
+    misfit could not be asked for.
+    """
+    misfit = decision.misfit
+    rejects = any(judgement.verdict is Verdict.REJECTED for judgement in decision.members.values())
+    if misfit is None or (rejects and not misfit.material) or decision.of(Member.MISFIT) is Verdict.UNDETERMINED:
+        return None
     return advised_camera_model(
         quality.shape.camera,
         misfit.group if misfit.material else None,

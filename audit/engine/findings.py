@@ -6,9 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.consistency import ModelConsistency
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, stale_finding
+from sfm_audit.audit.joint import JointAudit
 from sfm_audit.audit.noise.standardise import ModelTracks
-from sfm_audit.loaders.model import Finding, FindingCode
+from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
 _REMOVABLE_SHARE: Final = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
 
@@ -34,4 +36,35 @@ def residual_findings(stored: StoredErrors, tracks: ModelTracks, num_points: int
         count = int(np.count_nonzero(tracks.nonstationary))
         text = f"{count} images are not at the optimum of their poses, too many to leave out of the track statistics"
         found.append(Finding(FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES, count, text))
+    if not tracks.prior.converged and tracks.standardiser is not None:
+        text = f"the fit of the noise prior stopped at nu0 = {tracks.prior.nu0:.3g}, s0 = {tracks.prior.s0_px:.3g} px"
+        found.append(Finding(FindingCode.NOISE_PRIOR_NOT_CONVERGED, 1, text))
     return [finding for finding in found if finding is not None]
+
+
+def consistency_findings(consistency: ModelConsistency) -> list[Finding]:
+    """Return what the images say together about cameras, poses, points and 2D points."""
+    return [Finding(FindingCode(found.code.value), found.count, found.text) for found in consistency.findings]
+
+
+def joint_findings(model: SparseModel, joint: JointAudit | None) -> list[Finding]:
+    """Return parameters that nobody freed and that the joint system implies, and how it was solved."""
+    if joint is None:
+        return []
+    out = []
+    for one in joint.implied:
+        if one.found:
+            images = len(one.image_idxs)
+            whose = "all cameras of one size"
+            if one.camera_idx is not None:
+                whose = f"camera {int(model.cameras.camera_id[one.camera_idx])}"
+            values = ", ".join(
+                f"{name} {step:+.3g} +- {sd:.1g}" for name, step, sd in zip(one.names, one.step, one.sd, strict=True)
+            )
+            unit = f" {one.unit}" if one.unit != "1" else ""
+            text = f"{whose} ({images} images): freed, it would change by {values}{unit}"
+            out.append(Finding(FindingCode(f"implied_{one.parameter}"), images, text))
+    if joint.num_blocks > 1:
+        text = f"{joint.num_blocks} blocks of covisible images, each by itself"
+        out.append(Finding(FindingCode.JOINT_IN_BLOCKS, joint.num_blocks, text))
+    return out

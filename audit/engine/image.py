@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,16 +13,19 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import Decision, decide
 from sfm_audit.audit.decision.diagnostics import (
     CameraDiagnostics,
+    ConsistencyDiagnostics,
     Diagnostics,
+    Gains,
     MisfitDiagnostics,
     NoiseDiagnostics,
+    OwnDiagnostics,
     misfit_groups,
 )
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import image_advice
 from sfm_audit.audit.inliers.residuals import image_residuals
 from sfm_audit.audit.misfit import Retest, image_retest
-from sfm_audit.audit.misfit.peeling import Significance
+from sfm_audit.audit.misfit.significance import Significance
 from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
 from sfm_audit.audit.normality import NormalityTests, normality_tests
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
@@ -37,6 +42,9 @@ class ImageEvidence:
     track_length: (n,) audited observations of each inlier's track; None where the points are independent of the image.
     quality, misfit: of the camera, and the tests on which the verdict rests; both None without inliers.
     retest: tries another camera model on the residuals of those tests.
+    camera: the numbers of the camera that decide; those of ``quality`` where None.
+    consistency, own, has_own, gains: see `Diagnostics`.    expected_error_px: with the joint covariance, NaN unknown.
+    implied: changes that parameters which nobody freed would take, by column.
     """
 
     inliers: InlierSet
@@ -48,6 +56,13 @@ class ImageEvidence:
     quality: CameraQuality | None = None
     misfit: MisfitDiagnostics | None = None
     retest: Retest | None = None
+    camera: CameraDiagnostics | None = None
+    consistency: ConsistencyDiagnostics | None = None
+    own: OwnDiagnostics | None = None
+    has_own: bool = False
+    gains: Gains | None = None
+    expected_error_px: float = math.nan
+    implied: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +73,7 @@ class ImageAudit:
     noise, tests: under the chosen noise model.          constant, constant_tests: one scale for all raw residuals.
     quality: of the camera, as the model stands; None without inliers.
     diagnostics, decision: the numbers that decide, and what was decided.
+    expected_error_px, implied: see `ImageEvidence`.
     advised_camera_model: see `audit.misfit.advised_camera_model`.
     """
 
@@ -72,6 +88,8 @@ class ImageAudit:
     diagnostics: Diagnostics
     decision: Decision
     advised_camera_model: str | None
+    expected_error_px: float = math.nan
+    implied: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def image(self) -> ImageRecord:
@@ -158,7 +176,7 @@ def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
     decision = decide(diagnostics, config)
     advice = None
     if quality is not None and decision.misfit is not None and evidence.retest is not None:
-        advice = image_advice(quality, decision.misfit, evidence.retest, alpha=config.alpha)
+        advice = image_advice(quality, decision, evidence.retest, alpha=config.alpha)
     return ImageAudit(
         inliers=evidence.inliers,
         residuals_px=evidence.residuals_px.T,
@@ -171,6 +189,8 @@ def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
         diagnostics=diagnostics,
         decision=decision,
         advised_camera_model=advice,
+        expected_error_px=evidence.expected_error_px,
+        implied=evidence.implied,
     )
 
 
@@ -182,10 +202,14 @@ def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
         noise=NoiseDiagnostics(len(z), tests.num_values, tests.ks_stat, tests.ks_p, bool(np.isfinite(z).all())),
         pose_offset_px=evidence.pose_offset_px,
         misfit=evidence.misfit,
-        camera=None if evidence.quality is None else camera_diagnostics(evidence.quality),
+        camera=evidence.camera or (None if evidence.quality is None else camera_diagnostics(evidence.quality)),
         largest_residual_px=float(np.abs(evidence.residuals_px).max(initial=0.0)),
         longer_side_px=0 if camera is None else max(camera.width, camera.height),
         unusable=_unusable(evidence.inliers.image),
+        consistency=evidence.consistency,
+        own=evidence.own,
+        has_own=evidence.has_own,
+        gains=evidence.gains,
     )
 
 

@@ -13,24 +13,35 @@ from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, camera_quality
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.consistency import ModelConsistency, consistency_of
 from sfm_audit.audit.decision.decide import Decision
-from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit, misfit_groups
+from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras
-from sfm_audit.audit.engine.findings import residual_findings
-from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image
+from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, residual_findings
+from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, camera_diagnostics
+from sfm_audit.audit.engine.jointly import (
+    consistency_diagnostics,
+    expected_error_px,
+    gains_of,
+    implied_of,
+    joint_camera,
+    misfit_diagnostics,
+    own_diagnostics,
+    untested_misfit,
+)
 from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
-from sfm_audit.audit.misfit import MisfitTests, image_retest
+from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
+from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
-from sfm_audit.audit.misfit.peeling import UNTESTED, Blame, Peeling
 from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels, TableName, build_table, empty_table, schema
-from sfm_audit.audit.table.words import Member, ReasonCode
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.table.words import MisfitStatus, ReasonCode
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
 
 T = TypeVar("T")
@@ -150,16 +161,35 @@ class ModelAuditor:
         return tuple(self._spread(_quality_of, self))
 
     @cached_property
-    def blame(self) -> Blame:
-        """Misfit of all images, as the model stands and after the images at fault were peeled off."""
-        tests = [each.misfit if each else UNTESTED for each in self.quality]
-        if self.config.points == "independent":
-            return Blame.of_nobody(tests, self.residuals, most_are_wrong=False)
-        excluded = self.residuals.pose_offset_px > self.config.pose_offset_threshold_px
-        if 2 * np.count_nonzero(excluded) > np.count_nonzero(np.diff(self.residuals.offsets)):
-            excluded = np.zeros_like(excluded)
-        peeling = Peeling(self.model, self.residuals, excluded, alpha=self.config.alpha, tau_px=self.tau_px)
-        return peeling.run(tests)
+    def consistency(self) -> ModelConsistency:
+        """Whether cameras, poses, points and 2D points belong together."""
+        return consistency_of(self.model)
+
+    @cached_property
+    def moved(self) -> BoolArray:
+        """(I,) images whose pose is away from the optimum of their own residuals."""
+        return np.asarray(self.residuals.pose_offset_px > self.config.pose_offset_threshold_px)
+
+    @cached_property
+    def joint(self) -> JointAudit | None:
+        """What the joint system says; None where nobody is asked, because the parts do not belong together."""
+        if self.consistency.parts_disagree:
+            return None
+        return audit_jointly(
+            self.model,
+            self.residuals,
+            self.sigma_constant_px,
+            alpha=self.config.alpha,
+            tau_px=self.tau_px,
+            excluded=self.moved,
+            left_out=self.consistency.inconsistent,
+            points_independent=self.config.points == "independent",
+        )
+
+    @cached_property
+    def steps(self) -> dict[int, CameraStep]:
+        """By row of the camera table: the own parameters of the cameras in the joint system."""
+        return {} if self.joint is None else {step.camera_idx: step for step in self.joint.steps}
 
     @cached_property
     def cameras(self) -> list[CameraAudit]:
@@ -171,6 +201,7 @@ class ModelAuditor:
             self.sigma_constant_px,
             alpha=self.config.alpha,
             tau_px=self.tau_px,
+            holds=~self.moved & ~self.consistency.inconsistent,
         )
 
     def _xyz_cam(self, image_idx: int) -> FloatArray:
@@ -178,26 +209,20 @@ class ModelAuditor:
         return self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(point_idx, axis=0))
 
     def misfit(self, image_idx: int) -> MisfitDiagnostics | None:
-        """The final tests of the image in row ``image_idx``; None without inliers."""
+        """The tests on which the verdict about the image in row ``image_idx`` rests; None without inliers."""
         if self.quality[image_idx] is None:
             return None
-        num_tested = int(np.count_nonzero(self.blame.clean[self.residuals.rows(image_idx)]))
         sigma_px = float(self.sigma_constant_px[image_idx])
-        groups = misfit_groups(
-            self.blame.final_tests[image_idx],
-            self.blame.final.q[image_idx],
-            num_observations=num_tested,
-            sigma_px=sigma_px,
-        )
-        shared = self._shared_misfit(image_idx) if self.blame.most_are_wrong else None
-        return MisfitDiagnostics(groups, num_tested, sigma_px, shared)
+        if self.joint is None or self.consistency.inconsistent[image_idx]:
+            rows = self.residuals.rows(image_idx)
+            return untested_misfit(rows.stop - rows.start, sigma_px, MisfitStatus.EXCLUDED)
+        shared = self._shared_misfit(image_idx) if self.joint.misfit.most_are_wrong else None
+        return misfit_diagnostics(self.joint, image_idx, sigma_px, shared)
 
     def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
-        """The final tests of the image if it had been fitted with this camera, to first order."""
-        rows = self.residuals.rows(image_idx)
-        used = np.flatnonzero(self.blame.clean[rows])
-        residuals_px = self.blame.residuals_px[:, rows].take(used, axis=1)
-        return image_retest(self._xyz_cam(image_idx)[used], residuals_px)(camera)
+        """The misfit tests of the image if it had been fitted with this camera, to first order."""
+        residuals_px = self.residuals.residuals_px[:, self.residuals.rows(image_idx)]
+        return image_retest(self._xyz_cam(image_idx), residuals_px)(camera)
 
     def _shared_misfit(self, image_idx: int) -> SharedMisfit | None:
         """What the image's camera shows as a whole, if several images share it and together find a material misfit."""
@@ -245,8 +270,33 @@ class ModelAuditor:
             quality=self.quality[image_idx],
             misfit=self.misfit(image_idx),
             retest=partial(self._retest, image_idx),
+            consistency=consistency_diagnostics(
+                self.consistency.images[image_idx], all_behind=self.consistency.points_behind
+            ),
+            **self._of_camera(image_idx),
         )
         return audit_image(evidence, self.config)
+
+    def _of_camera(self, image_idx: int) -> dict[str, Any]:
+        """What the joint system says of the image's camera, as `ImageEvidence` has it."""
+        quality, joint = self.quality[image_idx], self.joint
+        if quality is None:
+            return {}
+        has_own = bool(fitted_param_idxs(quality.shape.camera.model))
+        step = self.steps.get(int(self.model.images.camera_idx[image_idx]))
+        if joint is None or step is None or not joint.num_observations[image_idx]:
+            return {"has_own": has_own}
+        sigma_px = float(self.sigma_constant_px[image_idx])
+        return {
+            "has_own": has_own,
+            "own": own_diagnostics(step, float(np.median(self.sigma_constant_px[step.image_idxs]))),
+            "gains": gains_of(joint, image_idx),
+            "camera": joint_camera(camera_diagnostics(quality), quality, step),
+            "expected_error_px": expected_error_px(
+                quality, joint.covariances[image_idx], sigma_px, quality.median_depth
+            ),
+            "implied": implied_of(joint.implied, step.camera_idx),
+        }
 
     def _noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
         """The image's noise under the chosen model."""
@@ -278,6 +328,10 @@ class ModelAuditor:
         length = self.tracks.statistics.track_length
         return observation_table(self.model, self.residuals, length, self.standardised, labels or self._own_labels)
 
+    def _camera_row(self, camera: CameraAudit, labels: ModelLabels) -> Row:
+        camera_idx = int(self.model.images.camera_idx[camera.image_idxs[0]])
+        return camera_row(camera, labels, self.steps.get(camera_idx), self.joint)
+
     @property
     def _own_labels(self) -> ModelLabels:
         return ModelLabels("", "", "0", self.model.location)
@@ -285,20 +339,21 @@ class ModelAuditor:
     def tables(self, labels: ModelLabels | None = None, *, observations: bool = False) -> ModelAudit:
         """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
         labels = labels or self._own_labels
-        _ = self.blame, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks  # shared
+        _ = self.joint, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks  # shared
         images = self._spread(partial(_images_of, labels=labels), self)
         rows = [row for row, _ in images]
         decisions = [decision for _, decision in images]
         num_exact = sum(
-            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in decision.members[Member.KS].reasons)
+            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in decision.all_reasons)
             for decision in decisions
         )
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
+        own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint)]
         findings = [*self.model.findings, *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(
             _images_table(rows),
-            _table("cameras", [camera_row(camera, labels) for camera in self.cameras]),
+            _table("cameras", [self._camera_row(camera, labels) for camera in self.cameras]),
             _table("models", [row]),
             self.observations(labels) if observations else None,
         )

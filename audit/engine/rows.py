@@ -9,17 +9,22 @@ from dataclasses import asdict
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.decision.decide import Decision
+from sfm_audit.audit.decision.diagnostics import OwnDiagnostics
 from sfm_audit.audit.decision.misfit import MisfitDecision
+from sfm_audit.audit.decision.severity import worth_of
 from sfm_audit.audit.engine.camera import CameraAudit
 from sfm_audit.audit.engine.image import ImageAudit
+from sfm_audit.audit.engine.jointly import implied_of, own_diagnostics
 from sfm_audit.audit.inliers.stored_errors import StoredErrors
+from sfm_audit.audit.joint import CameraStep, JointAudit
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
+from sfm_audit.audit.table.columns import IMPLIED, own_parameter_names
 from sfm_audit.audit.table.words import Member, Verdict
+from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
 
 Row = dict[str, object]
@@ -58,11 +63,14 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         **misfit_columns(quality.misfit if quality else None),
         **cause_columns(audit.misfit),
         "advised_camera_model": audit.advised_camera_model,
+        **_joint_misfit_columns(audit),
         "pose_offset_px": audit.pose_offset_px,
-        **_camera_columns(quality),
+        **_camera_columns(audit),
+        **own_columns(audit.diagnostics.own),
+        **{name: audit.implied.get(name, math.nan) for name in IMPLIED},
         "verdict": str(audit.verdict),
         **{str(member): audit.decision.of(member) for member in Member},
-        "severity": None,
+        "severity": audit.decision.severity,
         "reasons": [str(reason) for reason in audit.reasons],
         "reason_details": audit.decision.all_reasons,
     }
@@ -158,22 +166,75 @@ def cause_columns(misfit: MisfitDecision | None) -> Row:
     }
 
 
-def _camera_columns(quality: CameraQuality | None) -> Row:
-    known = quality.identifiability if quality else None
-    plausible = quality.shape.plausibility if quality else None
+def _joint_misfit_columns(audit: ImageAudit) -> Row:
+    """Effect, q and rank of every group in the joint test, and what the named misfit is worth."""
+    misfit, found = audit.diagnostics.misfit, audit.misfit
+    row: Row = {}
+    for group in GROUPS:
+        test = misfit.groups[group] if misfit else None
+        row[f"misfit_{group}_px_joint"] = test.px if test else math.nan
+        row[f"misfit_{group}_q_joint"] = test.q if test else math.nan
+        row[f"misfit_{group}_rank_joint"] = test.rank if test else None
+    worth = worth_of(found, misfit)
+    sigma_px = audit.constant.sigma_constant_px
     return {
-        "sd_focal_px": known.sd_focal_px if known else math.nan,
-        "sd_focal_rel": known.sd_focal_rel if known else math.nan,
-        "sd_k1": known.sd_k1 if known else math.nan,
-        "focal_over_size": plausible.focal_over_size if plausible else math.nan,
-        "folds_over": plausible.folds_over if plausible else None,
-        "expected_error_px": quality.expected_error_px if quality else math.nan,
+        **row,
+        "misfit_px_sigma": found.px / sigma_px if found and sigma_px > 0 else math.nan,
+        "misfit_worth_deg": worth.rotation_deg if worth else math.nan,
+        "misfit_worth_centre": worth.centre_rel if worth else math.nan,
+        "misfit_worth_focal_rel": worth.focal_rel if worth else math.nan,
     }
 
 
-def camera_row(audit: CameraAudit, labels: ModelLabels) -> Row:
-    """Return the row of one camera."""
+def _camera_columns(audit: ImageAudit) -> Row:
+    quality, camera = audit.quality, audit.diagnostics.camera
+    if quality is None or camera is None:
+        numbers = ("sd_focal_px", "sd_focal_rel", "sd_k1")
+        names = (*numbers, *(f"{name}_conditional" for name in numbers), "sd_focal_rel_joint", "focal_over_size")
+        return {
+            **dict.fromkeys((*names, "expected_error_px", "expected_error_px_conditional"), math.nan),
+            "folds_over": None,
+        }
+    known, shape = quality.identifiability, quality.shape
+    focals = [shape.camera.params[i] for i in shape.camera.model.focal_idxs]
+    sd_focal_px = _sd_of_first_focal(audit.diagnostics.own, shape.camera.model) if camera.is_joint else math.nan
+    return {
+        "sd_focal_px": sd_focal_px if camera.is_joint and focals else known.sd_focal_px,
+        "sd_focal_rel": camera.sd_focal_rel,
+        "sd_k1": camera.sd_k1,
+        "sd_focal_rel_joint": camera.sd_focal_rel if camera.is_joint else math.nan,
+        "sd_focal_px_conditional": known.sd_focal_px,
+        "sd_focal_rel_conditional": known.sd_focal_rel,
+        "sd_k1_conditional": known.sd_k1,
+        "focal_over_size": shape.plausibility.focal_over_size,
+        "folds_over": shape.plausibility.folds_over,
+        "expected_error_px": audit.expected_error_px if camera.is_joint else quality.expected_error_px,
+        "expected_error_px_conditional": quality.expected_error_px,
+    }
+
+
+def _sd_of_first_focal(own: OwnDiagnostics | None, model: CameraModel) -> float:
+    first = model.param_names[model.focal_idxs[0]] if model.focal_idxs else ""
+    return next((step.sd for step in own.steps if step.name == first), math.nan) if own else math.nan
+
+
+def own_columns(own: OwnDiagnostics | None) -> Row:
+    """Return the joint step of every parameter that some camera model has."""
+    steps = {step.name: step for step in own.steps} if own else {}
+    row: Row = {"own_step_px": own.step_px if own else math.nan}
+    for name in own_parameter_names():
+        step = steps.get(name)
+        row[f"own_{name}_step"] = step.step if step else math.nan
+        row[f"own_{name}_sd"] = step.sd if step else math.nan
+    return row
+
+
+def camera_row(
+    audit: CameraAudit, labels: ModelLabels, step: CameraStep | None = None, joint: JointAudit | None = None
+) -> Row:
+    """Return the row of one camera; ``step``: its own parameters in the joint system, where it takes part."""
     camera = audit.camera
+    implied = implied_of(joint.implied, step.camera_idx) if joint and step else {}
     return {
         **asdict(labels),
         "camera_id": camera.camera_id,
@@ -187,6 +248,10 @@ def camera_row(audit: CameraAudit, labels: ModelLabels) -> Row:
         **misfit_columns(audit.tests),
         **cause_columns(audit.misfit),
         "advised_camera_model": audit.advised_camera_model,
+        **own_columns(own_diagnostics(step, math.nan) if step else None),
+        **{name: implied.get(name, math.nan) for name in (*IMPLIED, *(f"{name}_sd" for name in IMPLIED))},
+        "sd_focal_rel_joint": step.sd_focal_rel if step else math.nan,
+        "joint_blocks": joint.num_blocks if joint else None,
         "misfit_material": bool(audit.misfit.material),
     }
 

@@ -27,7 +27,7 @@ class JointAudit:
 
     steps: of every camera with images in the system.    misfit: of every image.    implied: see `ImpliedParameter`.
     gains: per image.    covariances: per image, see `JointSystem.image_covariances`.
-    excluded: (I,) images whose misfit was not asked for.
+    excluded: (I,) images whose misfit was not asked for.    num_observations: (I,) that took part.
     num_blocks: more than one where the model was too large for one system; numbers are then those of blocks: a camera
     that several blocks share is told of by the block that has most of its observations, q is of the block's images.
     """
@@ -38,6 +38,7 @@ class JointAudit:
     gains: tuple[Gains, ...]
     covariances: tuple[FloatArray, ...]
     excluded: BoolArray
+    num_observations: IntArray
     num_blocks: int
 
 
@@ -97,8 +98,9 @@ def _of_block(
     covariances = [np.zeros((0, 0))] * len(block.core)
     for image, covariance in zip(core, system.image_covariances(core), strict=True):
         gains[image], covariances[image] = image_gains(system, image), covariance
+    counts = np.diff(system.observations.offsets)
     misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out)
-    return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, 1)
+    return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, counts, 1)
 
 
 def _merged(parts: list[tuple[Block, JointAudit]], tau_px: FloatArray) -> JointAudit:
@@ -137,5 +139,6 @@ def _merged(parts: list[tuple[Block, JointAudit]], tau_px: FloatArray) -> JointA
         tuple(found.gains[i] for i, found in enumerate(source)),
         tuple(found.covariances[i] for i, found in enumerate(source)),
         np.array([found.excluded[i] for i, found in enumerate(source)]),
+        np.array([found.num_observations[i] for i, found in enumerate(source)]),
         len(parts),
     )

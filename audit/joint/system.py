@@ -99,7 +99,7 @@ class JointSystem:
     def image_covariances(self, image_idxs: Sequence[int]) -> list[FloatArray]:
         """Return (6 + q, 6 + q) each: sandwich covariance S^+ M S^+ of an image's pose and own parameters.
 
-        In the order of `audit.camera_quality.identifiability.fitted_names`, NaN in the rows of parameters that are not identified and
+        In the order of `identifiability.fitted_names`, NaN in the rows of parameters that are not identified and
         for images without columns. The pose is relative to the whole model: the gauge is projected out.
 
         Of what was tried this predicts the true error of real models best (356 healthy images with ground truth: rank

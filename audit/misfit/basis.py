@@ -78,31 +78,6 @@ def nuisance_basis(columns: FloatArray, *, exact: bool = False) -> FloatArray:
     return exact_basis(columns, NUISANCE_THRESHOLD * largest)
 
 
-def nuisance_transform(columns: FloatArray) -> FloatArray:
-    """Return T, (q', q), such that T N is an orthonormal basis of the columns N (q, m), as of `nuisance_basis`.
-
-    For those who need the basis at a few of the m values, several times.
-    """
-    norms = column_norms(columns)
-    used = np.flatnonzero(norms != 0)
-    unit = columns[used] / norms[used, None]
-    transform = np.zeros((0, 0))
-    if used.size:
-        values, vectors = np.linalg.eigh(unit @ unit.T)
-        if values[0] > _SMALLEST_PIVOT * values[-1]:
-            transform = (vectors / np.sqrt(values)).T
-            basis = transform @ unit
-            values, vectors = np.linalg.eigh(basis @ basis.T)
-            transform = (vectors / np.sqrt(values)).T @ transform
-        else:  # singular vectors: those kept, over their singular values
-            _, singular, rows = np.linalg.svd(np.linalg.qr(unit.T, mode="r"))
-            kept = singular > NUISANCE_THRESHOLD * singular[0]
-            transform = rows[kept] / singular[kept, None]
-    out = np.zeros((len(transform), len(columns)))
-    out[:, used] = transform / norms[used]
-    return out
-
-
 def project_off(basis: FloatArray, columns: FloatArray) -> FloatArray:
     """Return columns (..., m) minus their projections on an orthonormal basis (q, m)."""
     return np.asarray(columns - (columns @ basis.T) @ basis, dtype=np.float64)

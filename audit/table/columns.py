@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from sfm_audit.audit.table.arrow import build_table
 from sfm_audit.audit.table.words import GROUP_MEANINGS, Member, Verdict
+from sfm_audit.loaders.camera_models import CAMERA_MODELS
 
 __all__ = [
     "CALIBRATION",
@@ -106,7 +107,7 @@ def _misfit_groups() -> tuple[Column, ...]:
 def _misfit() -> tuple[Column, ...]:
     return (
         *_misfit_groups(),
-        _text("misfit_group", "named cause among the significant groups; for images after peeling"),
+        _text("misfit_group", "named cause among the significant groups; for images of the joint test"),
         _px("misfit_px", "effect of misfit_group"),
         _number("misfit_q", "q-value of misfit_group: Holm over the groups, Benjamini-Hochberg over the model"),
         _text("advised_camera_model", "smallest COLMAP model that holds what was found, or none: and what it is"),
@@ -125,6 +126,50 @@ REASON_DETAIL: Final = pa.struct(
     ]
 )
 """One reason: its code, the verdict it speaks for, the number that triggered it, its limit, and the same in words."""
+
+
+def _joint_misfit() -> tuple[Column, ...]:
+    out = []
+    for group, words in GROUP_MEANINGS.items():
+        out += [
+            _px(f"misfit_{group}_px_joint", f"RMS length of the field of {words} that nothing else could take up"),
+            _number(f"misfit_{group}_q_joint", f"q-value of the joint test for {words}"),
+            _count(f"misfit_{group}_rank_joint", f"free directions of {words} in the joint test"),
+        ]
+    return (
+        *out,
+        _number("misfit_px_sigma", "misfit_px / sigma_constant_px"),
+        Column("misfit_worth_deg", pa.float64(), "deg", "rotation of the image if misfit_group were admitted"),
+        _number("misfit_worth_centre", "shift of its centre then, in units of the median depth"),
+        _number("misfit_worth_focal_rel", "relative change of its focal length then"),
+    )
+
+
+def _own_steps() -> tuple[Column, ...]:
+    out = [_px("own_step_px", "what freeing the camera's own parameters alone would gain in the joint system")]
+    for name in own_parameter_names():
+        out += [
+            _number(f"own_{name}_step", f"change of {name} that adjusting everything would make, in its unit"),
+            _number(f"own_{name}_sd", f"standard deviation of {name} in the joint system"),
+        ]
+    return (*out, *(_number(name, f"{words}, had it alone been freed") for name, words in IMPLIED.items()))
+
+
+def own_parameter_names() -> tuple[str, ...]:
+    """Return the names of all parameters that COLMAP refines by default, in the order of its models."""
+    fixed = {"cx", "cy", "w", "h"}
+    return tuple(dict.fromkeys(name for model in CAMERA_MODELS for name in model.param_names if name not in fixed))
+
+
+IMPLIED: Final = {
+    "implied_cx": "change of the principal point, px",
+    "implied_cy": "change of the principal point, px",
+    "implied_radial": "next radial coefficient that the model lacks",
+    "implied_aspect": "fx / fy - 1 where the model has one focal length",
+    "implied_p1": "first tangential coefficient where the model has none",
+    "implied_p2": "second tangential coefficient where the model has none",
+}
+"""Columns of parameters that nobody freed (method.md section 11)."""
 
 IMAGES: Final[tuple[Column, ...]] = (
     *_IDENTITY,
@@ -182,16 +227,23 @@ IMAGES: Final[tuple[Column, ...]] = (
     _number("skewness_constant", "skewness under the constant noise model"),
     _number("kurtosis_constant", "excess kurtosis under the constant noise model"),
     *_misfit(),
+    *_joint_misfit(),
     _px("pose_offset_px", "RMS residual that a change of this image's pose alone would remove; ~0 after adjustment"),
-    _px("sd_focal_px", "standard deviation of the first focal length, conditional on the points (a lower bound)"),
-    _number("sd_focal_rel", "largest sd_f / f, conditional on the points (a lower bound)"),
-    _number("sd_k1", "standard deviation of the first distortion parameter, conditional on the points"),
+    _px("sd_focal_px", "standard deviation of the first focal length in the joint system; real errors are about 5 x"),
+    _number("sd_focal_rel", "largest sd_f / f in the joint system; null where f is not identified"),
+    _number("sd_k1", "standard deviation of the first distortion parameter in the joint system"),
+    _number("sd_focal_rel_joint", "the same as sd_focal_rel; null where the image takes no part in the joint system"),
+    _px("sd_focal_px_conditional", "sd of the first focal length, conditional on the points: a lower bound"),
+    _number("sd_focal_rel_conditional", "largest sd_f / f, conditional on the points: a lower bound"),
+    _number("sd_k1_conditional", "sd of the first distortion parameter, conditional on the points: a lower bound"),
+    *_own_steps(),
     _number("focal_over_size", "first focal length / max(width, height)"),
     _bool("folds_over", "whether the distortion folds inside the image"),
-    _px("expected_error_px", "expected error of a measurement with this camera, median over a 16 x 16 grid"),
+    _px("expected_error_px", "expected error of a measurement with this camera and pose, median over a 16 x 16 grid"),
+    _px("expected_error_px_conditional", "the same, conditional on the points: a lower bound"),
     _text("verdict", "accepted, rejected or undetermined under the policy of the run"),
     _text("verdict_ks", "rejected when ks_p < alpha; undetermined with too few standardised observations"),
-    _text("verdict_misfit", "rejected when a group has q < alpha and an effect above min_effect, after peeling"),
+    _text("verdict_misfit", "rejected when a group has q < alpha and an effect above min_effect in the joint test"),
     _text("verdict_pose", "rejected when pose_offset_px is above its threshold"),
     _text("plausible", "rejected when this cannot be a camera, undetermined when the image says too little of it"),
     _text("verdict_camera", "rejected when its own parameters are not at their optimum, or parts do not fit together"),
@@ -213,6 +265,10 @@ CAMERAS: Final[tuple[Column, ...]] = (
     _count("num_points3d", "3D points that they see"),
     _count("num_observations", "their inliers"),
     *_misfit(),
+    *_own_steps(),
+    *(_number(f"{name}_sd", f"standard deviation of {name}") for name in IMPLIED),
+    _number("sd_focal_rel_joint", "largest sd_f / f in the joint system"),
+    _count("joint_blocks", "blocks in which the joint system was solved; 1: whole"),
     _bool("misfit_material", "whether misfit_group has q < alpha and an effect above min_effect"),
 )
 
@@ -337,7 +393,8 @@ CALIBRATION: Final[tuple[Column, ...]] = (
     _count("occupied_cells", "cells with at least one inlier, of an 8 x 8 grid over the image"),
     _number("focal_over_size", "first focal length / max(width, height)"),
     _bool("folds_over", "whether the distortion folds inside the image"),
-    _px("expected_error_px", "expected error of a measurement with this camera, median over a 16 x 16 grid"),
+    _px("expected_error_px", "expected error of a measurement with this camera and pose, median over a 16 x 16 grid"),
+    _px("expected_error_px_conditional", "the same, conditional on the points: a lower bound"),
     _text("verdict", "accepted, rejected or undetermined under the policy"),
     _text("verdict_ks", "rejected when ks_p < alpha"),
     _text("verdict_misfit", "rejected when a group has p < alpha (Holm) and an effect above tau_px"),

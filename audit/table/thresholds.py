@@ -28,12 +28,25 @@ MAX_POSE_OFFSET_PX: Final = Threshold(
 )
 MIN_FOCAL_OVER_SIZE: Final = Threshold(0.3, "f / max(width, height) below which a camera is implausible")
 MAX_FOCAL_OVER_SIZE: Final = Threshold(10.0, "f / max(width, height) above which a camera is implausible")
-MAX_SD_FOCAL_REL: Final = Threshold(0.01, "sd of f / f above which the focal length is not identified")
+MAX_SD_FOCAL_REL: Final = Threshold(0.005, "joint sd of f / f above which the focal length is not identified")
 MIN_K1_SDS: Final = Threshold(2.0, "|k1| / sd below which k1 is not identified (a remark)")
 MIN_COVERAGE: Final = Threshold(0.2, "share of the image under the inliers' hull below which nothing is said")
 MIN_OCCUPIED_CELLS: Final = Threshold(16, "occupied cells (of grid x grid) below which nothing is said")
-EXACT_SHARE: Final = 1e-9
-"""Residuals below this share of the longer side of the image are rounding, not measurement."""
+MAX_NOISE_DISTANCE: Final = Threshold(
+    0.03, "verdict_noise rejects where D - 1.36 / sqrt(N) is larger: a difference that can be seen at any N"
+)
+KS_CRITICAL: Final = 1.36
+"""Times 1 / sqrt(N): the 5 % point of the Kolmogorov-Smirnov distance."""
+MIN_OWN_STEP_SDS: Final = 5.0
+"""An own parameter's step counts from so many of its standard deviations on (method.md section 11)."""
+EXACT_SHARE: Final = 2.0**-23
+"""Residuals below this share of the longer side of the image are rounding of float32, not measurement."""
+HARD_WORTH_DEG: Final = 0.2
+HARD_WORTH_FOCAL_REL: Final = 0.01
+"""A misfit that is worth more than this in rotation (degrees) or in f (share) is hard ..."""
+WEAK_WORTH_DEG: Final = 0.02
+WEAK_WORTH_FOCAL_REL: Final = 0.001
+"""... and one worth less than this in both is weak (method.md section 11)."""
 
 
 def effect_px(min_effect: str, sigma_px: float | None) -> float | None:

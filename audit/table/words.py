@@ -157,6 +157,12 @@ class ReasonCode(StrEnum):
     LOW_COVERAGE = "low_coverage"
     FEW_OCCUPIED_CELLS = "few_occupied_cells"
     FRONTO_PARALLEL = "fronto_parallel"
+    INCONSISTENT = "inconsistent"
+    POINTS_BEHIND = "points_behind"
+    CAMERA_NOT_OPTIMAL = "camera_not_optimal"
+    CAMERA_NOT_TESTED = "camera_not_tested"
+    MISFIT_WITHOUT_WORTH = "misfit_without_worth"
+    NOISE_DIFFERS = "noise_differs"
     DEGENERATE_INPUT = "degenerate_input"
 
 
@@ -261,6 +267,28 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
         "the points lie in a plane nearly parallel to the image: tilt, correlation of f",
         Member.PLAUSIBLE,
         note="of calibrate",
+    ),
+    ReasonCode.INCONSISTENT: _rejects(
+        "camera, pose, points and 2D points do not belong together: what was found, and the cause where it is known",
+        Member.CAMERA,
+    ),
+    ReasonCode.POINTS_BEHIND: _leaves_open(
+        "all observations of the model lie behind their cameras: axes flipped, or poses inverted?", *_ALL
+    ),
+    ReasonCode.CAMERA_NOT_OPTIMAL: _rejects(
+        "a parameter of the camera is not where adjusting everything would put it: stored and implied value, sd, px",
+        Member.CAMERA,
+    ),
+    ReasonCode.CAMERA_NOT_TESTED: _leaves_open(
+        "the camera takes no part in the joint system: too few inliers, unknown noise or odd derivatives", Member.CAMERA
+    ),
+    ReasonCode.MISFIT_WITHOUT_WORTH: _remarks(
+        "a misfit above min_effect that would change pose and focal length by next to nothing (decides nothing): px, "
+        "degrees, share of f",
+        Member.MISFIT,
+    ),
+    ReasonCode.NOISE_DIFFERS: _rejects(
+        "the noise is visibly another one: D - 1.36 / sqrt(N), its limit, number of values", Member.NOISE
     ),
     ReasonCode.DEGENERATE_INPUT: _leaves_open(
         "the correspondences determine no camera: in which way, and the number that says so", *_ALL, note="of calibrate"
