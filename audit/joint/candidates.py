@@ -68,7 +68,7 @@ def candidate_scores(base: Base, images: Sequence[int], fields_of: Callable[[int
     if not observations.points_independent:
         for part, around in chunks:
             coupling.subtract_tracks(right, around, absorbed[part])
-    solution = base.inverse.block(coupling.support) @ right[:-1]
+    solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
     score = track_score.sum(axis=0)
     padded = np.vstack([solution, np.zeros((1, count))])

@@ -16,7 +16,7 @@ _DEAD: Final = 1e-12  # share of B's diagonal that the elimination of points lea
 _GAUGE_EIGENVALUE: Final = 1e-8  # a claimed direction of the gauge that costs more is none
 _SHIFT: Final = 1e-12
 _MAX_NULL: Final = 512
-_INVERSE_ITERATIONS: Final = 12
+_INVERSE_ITERATIONS: Final = 6
 _IN_NULL: Final = 1e-6  # squared length of a parameter in null directions from which on it is not identified
 
 
@@ -42,19 +42,16 @@ class JointInverse:
         """D + m."""
         return len(self.main) + len(self.corner)
 
-    def block(self, support: IntArray) -> FloatArray:
-        """Return the entries at some sorted rows and the same columns."""
-        d = len(self.main)
+    def within(self, support: IntArray, right: FloatArray) -> FloatArray:
+        """Return (s, c): the entries at some sorted rows and the same columns, times right (s, c)."""
+        if support.size == self.size:
+            return self.times(support, right)
         base, extra = self._split(support)
-        k = base.size
-        out = np.empty((support.size, support.size))
-        out[:k, :k] = self.main if k == d else self.main[np.ix_(base, base)]
+        head, tail = right[: base.size], right[base.size :]
         update = self.update[base]
-        out[:k, :k] += update @ update.T
-        out[:k, k:] = self.border[np.ix_(base, extra)]
-        out[k:, :k] = out[:k, k:].T
-        out[k:, k:] = self.corner[np.ix_(extra, extra)]
-        return out
+        border = self.border[np.ix_(base, extra)]
+        above = self.main[np.ix_(base, base)] @ head + update @ (update.T @ head) + border @ tail
+        return np.vstack([above, border.T @ head + self.corner[np.ix_(extra, extra)] @ tail])
 
     def _split(self, support: IntArray) -> tuple[IntArray, IntArray]:
         d = len(self.main)
@@ -140,9 +137,10 @@ class _Factor:
 
 def _dense(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> FloatArray:
     """S with unit diagonal plus Z Z^T; 1 on the diagonal of dead columns. In Fortran order, for LAPACK."""
-    out = matrix.toarray(order="F")
-    out /= scale[:, None]
-    out /= scale
+    by = 1.0 / scale
+    scaled = matrix.copy()
+    scaled.data *= by[scaled.indices] * np.repeat(by, np.diff(scaled.indptr))
+    out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
     if dead.any():
         out[dead] = 0.0
         out[:, dead] = 0.0

@@ -26,7 +26,8 @@ class CameraStep:
     implied: (q,) the values that the step speaks for: stored + step, but see `_implied_focal`.
     plain_step: (q,) with w = 1: what a least-squares adjuster would do. Nothing should be rejected unless both agree.
     own_step_px: what freeing these parameters alone would gain, RMS px; plain_step_px: the same of ``plain_step``.
-    sd_focal_rel: largest sd_f / |f|, NaN where a focal length is not identified or there is none.
+    sd_focal_rel: sd_f / |f|, of both focal lengths together where there are two (see `_sd_focal_rel`); NaN where one is
+    not identified or there is none.
     focal_identified: whether all focal lengths are.
     """
 
@@ -88,7 +89,8 @@ def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -
     sigma_px = float(np.median(observations.sigma_px[images]))
     step, plain = system.base.step[columns], system.plain_step[columns]
     sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    focal = np.array([sd[params.index(i)] / abs(camera.params[i]) for i in camera.model.focal_idxs])
+    focals = [params.index(i) for i in camera.model.focal_idxs]
+    sd_focal_rel = _sd_focal_rel(covariance[np.ix_(focals, focals)], camera.params[list(camera.model.focal_idxs)])
     px = [sigma_px * math.sqrt(wald(system, columns, value) / n) if n else math.nan for value in (step, plain)]
     return CameraStep(
         camera_idx,
@@ -101,12 +103,29 @@ def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -
         plain,
         px[0],
         px[1],
-        float(focal.max()) if focal.size else math.nan,
-        bool(np.isfinite(focal).all()),
+        sd_focal_rel,
+        bool(not focals or math.isfinite(sd_focal_rel)),
         _implied(
             system, images, camera.params[params] + step, [params.index(i) for i in camera.model.focal_idxs], step
         ),
     )
+
+
+def _sd_focal_rel(covariance: FloatArray, focals: FloatArray) -> float:
+    """Return sd_f / |f| from the covariance (k, k) of k focal lengths, NaN without any.
+
+    Two focal lengths are one lens: what is asked is how well its focal length is known, pixels taken as square as
+    stored. A forward sequence leaves fy open to 0.9 % and fx to 0.1 %; its focal length is known to 0.1 %, and
+    own_fy_sd says the rest.
+    """
+    if not focals.size or not np.isfinite(covariance).all():
+        return math.nan
+    relative = covariance / focals / focals[:, None]
+    if focals.size == 1:
+        return math.sqrt(max(float(relative[0, 0]), 0.0))
+    one = np.ones(focals.size)
+    information = float(one @ np.linalg.pinv(relative, hermitian=True) @ one)
+    return 1.0 / math.sqrt(information) if information > 0 else math.nan
 
 
 def _implied(

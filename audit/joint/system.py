@@ -185,8 +185,9 @@ def joint_system(
     base = with_step(
         Base(observations, reduced.point_inverse, inverse, step, nothing[:, :3], nothing[:, :2], nothing, {}), step
     )
-    meat = score_meat(observations, base.view_scores)
-    return JointSystem(model, residuals, base, reduced, meat, _plain_step(plain, base, gauge))
+    plain_step = _plain_step(plain, base, gauge)
+    del plain
+    return JointSystem(model, residuals, base, reduced, score_meat(observations, base.view_scores), plain_step)
 
 
 def with_step(base: Base, step: FloatArray) -> Base:

@@ -18,6 +18,7 @@ from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.group_test import test_group as judge_group
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.inverse import joint_inverse
+from sfm_audit.audit.joint.worth import worth_of
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 
@@ -170,6 +171,24 @@ def test_inclusion_is_the_same_as_columns_more(system, reference):
         np.add.at(by_track, np.repeat(reference.point, 2), projected * left[:, None])
         seen = np.unique(system.observations.point_idx[system.observations.rows(image)])
         assert_allclose(scores.track_score / unit, by_track[seen] / unit, atol=1e-6)
+
+
+def test_worth_is_how_far_inclusion_moves_the_image(system, model):
+    own, group = fields_of(system, 2), GROUP_COLUMNS[MisfitGroup.ROLLING_SHUTTER]
+    scores = candidate_scores(system.base, [2], lambda _: own)
+    root = group_root(scores, group)
+    worth = worth_of(system, 2, scores, group, root)
+    base = include(system.base, [Candidate(2, ImageFields(own.fields[:, :, group] @ root.T, own.nuisance))])
+    columns = system.observations.layout.columns[2]
+    moved = (base.step[: len(system.base.step)] - system.base.step)[columns]
+    image = model.image(2)
+    depth = np.median(image.cam_from_world(model.points.xyz_world[np.unique(model.observations.point_idx)])[:, 2])
+    assert worth.rotation_deg == pytest.approx(np.degrees(np.linalg.norm(moved[:3])), rel=1e-6)
+    assert worth.centre_rel == pytest.approx(np.linalg.norm(moved[3:6]) / system.median_depth(2), rel=1e-6)
+    assert system.median_depth(2) == pytest.approx(depth, rel=0.5)
+    focal = moved[6] / image.camera.params[0]
+    if image.camera.model.name != "OPENCV":
+        assert worth.focal_rel == pytest.approx(focal, rel=1e-6)
 
 
 def test_inclusion_leaves_the_base_system_as_it_was(system):
