@@ -171,9 +171,10 @@ def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) 
 
 def _rms_px(residuals: ModelResiduals, counts: IntArray) -> FloatArray:
     """(I,) root mean square length of all inliers' residuals, NaN without any."""
-    sums = np.concatenate([[0.0], np.cumsum((residuals.residuals_px**2).sum(axis=0))])
+    image = np.repeat(np.arange(len(counts)), counts)  # by image: differences of a running sum lose what is small
+    sq_px2 = (residuals.residuals_px**2).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(np.diff(sums[residuals.offsets]) / counts)
+        return np.asarray(np.sqrt(np.bincount(image, sq_px2, len(counts)) / counts))
 
 
 def _regular_points(residuals: ModelResiduals, weight: FloatArray, num_points: int) -> BoolArray:
