@@ -36,7 +36,7 @@ class House:
 
 
 def is_closed(room: Room) -> bool:
-    """Whether a room's row is for all modules in it; the doors (audit, loaders, reports, the root) are only themselves."""
+    """Whether a row is for all modules in the room; a door (audit, loaders, reports, the root) is only itself."""
     return room.count(".") >= 1
 
 
@@ -84,7 +84,9 @@ def foreign_imports(graph: ImportGraph, root: str, house: House) -> tuple[list[s
         for imported in sorted(graph.find_modules_directly_imported_by(module)):
             target = rooms.get(imported, room)
             if target != room and target not in house.allowed[room]:
-                lines = {detail["line_number"] for detail in graph.get_import_details(importer=module, imported=imported)}
+                lines = {
+                    detail["line_number"] for detail in graph.get_import_details(importer=module, imported=imported)
+                }
                 wrong.append(f"{module} -> {imported} (l.{', l.'.join(map(str, sorted(lines)))}): {room} -> {target}")
     return homeless, wrong
 
@@ -102,7 +104,7 @@ class RoomsContract(Contract):
     rooms = HouseField()
     ignore_imports = fields.SetField(subfield=fields.ImportExpressionField(), required=False)
 
-    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:  # noqa: ARG002, FBT001 - import-linter's signature
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:  # noqa: ARG002 - import-linter's signature
         """Compare the imports with the table."""
         options: Any = self  # import-linter replaces the fields by their values
         warnings = contract_utils.remove_ignored_imports(
