@@ -67,18 +67,20 @@ if not all((Path(__file__).parent / room).is_dir() for room in ("audit", "loader
     )
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name from the module it lives in."""
-    if name == "__version__":
-        from importlib.metadata import version  # noqa: PLC0415 - costs more than all of this
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for Any
 
-        return version("sfm-audit")
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
-    value = getattr(module, _RENAMED.get(name, name))
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> Any:
+        """Import a public name from the module it lives in."""
+        if name == "__version__":
+            from importlib.metadata import version  # noqa: PLC0415 - costs more than all of this
+
+            return version("sfm-audit")
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+        value = getattr(module, _RENAMED.get(name, name))
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
