@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 import sfm_audit
 from sfm_audit import (
     AuditConfig,
+    Decision,
     ImageAudit,
-    Judgement,
     LoadError,
     ModelAudit,
     ModelAuditor,
@@ -44,10 +44,10 @@ image = auditor.image("IMG_0010.jpg")
 assert_type(image, ImageAudit)
 assert_type(audit_inliers(inliers), ImageAudit)
 assert_type(image.verdict, Verdict)
-assert_type(image.judgement, Judgement)
+assert_type(image.decision, Decision)
 assert_type(image.pose_offset_px, float)
-assert_type(image.judgement.reasons, tuple[Reason, ...])
-assert_type(image.judgement.reasons[0].code, ReasonCode)
+assert_type(image.decision.reasons, tuple[Reason, ...])
+assert_type(image.decision.reasons[0].code, ReasonCode)
 
 audit = audit_reconstruction(model)
 assert_type(audit, ModelAudit)
