@@ -1,40 +1,63 @@
-"""Check that a wheel holds every file of the three packages, data files included, and nothing else."""
+"""Check that a wheel or an sdist holds every file of the package, data files included, and no other import name."""
 
 import argparse
 import sys
+import tarfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("loaders", "audit", "reports")
+PACKAGE = "sfm_audit"
+ROOMS = ("loaders", "audit", "reports")
+# Files of an sdist outside the package: what is needed to build it, and what a packager runs and reads.
+BESIDE = {".gitignore", "CHANGELOG.md", "CITATION.cff", "LICENSE", "PKG-INFO", "README.md", "pyproject.toml"}
+BESIDE_FOLDERS = {"docs", "scripts", "tests"}
 
 
 def in_tree() -> set[str]:
-    """Files of the packages, as the wheel should name them."""
-    files = (path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file())
-    return {path.relative_to(ROOT).as_posix() for path in files if path.suffix != ".pyc"}
+    """Files of the package, as a wheel should name them; from the folders, so that the links need not work."""
+    return {f"{PACKAGE}/{path.relative_to(ROOT).as_posix()}" for room in ROOMS for path in _files(ROOT / room)} | {
+        path.relative_to(ROOT).as_posix() for path in (ROOT / PACKAGE).iterdir() if path.is_file()
+    }
 
 
-def in_wheel(path: Path) -> set[str]:
-    """Files of a wheel without its own metadata."""
-    with zipfile.ZipFile(path) as wheel:
-        return {name for name in wheel.namelist() if ".dist-info/" not in name}
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc")
+
+
+def in_archive(path: Path) -> set[str]:
+    """Files of a wheel, or of an sdist below its folder; without a wheel's own metadata."""
+    if path.suffix == ".whl":
+        with zipfile.ZipFile(path) as wheel:
+            return {name for name in wheel.namelist() if ".dist-info/" not in name}
+    with tarfile.open(path) as sdist:
+        return {name.partition("/")[2] for name in sdist.getnames()}
+
+
+def faults(path: Path) -> list[str]:
+    """Say what an archive lacks and what it should not hold."""
+    expected, found = in_tree(), in_archive(path)
+    if path.suffix != ".whl":
+        found = {name for name in found if name not in BESIDE and name.partition("/")[0] not in BESIDE_FOLDERS}
+    lacks = [f"lacks {name}" for name in sorted(expected - found)]
+    return lacks + [f"should not hold {name}" for name in sorted(found - expected)]
 
 
 def main() -> int:
-    """Compare; return the exit code."""
+    """Check each; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("wheel", type=Path)
-    path = parser.parse_args().wheel
-    expected, found = in_tree(), in_wheel(path)
-    for name in sorted(expected - found):
-        print(f"{path.name}: lacks {name}", file=sys.stderr)
-    for name in sorted(found - expected):
-        print(f"{path.name}: should not hold {name}", file=sys.stderr)
-    if expected != found:
-        return 1
-    print(f"{path.name}: {len(found)} files, {path.stat().st_size // 1024} KiB")
-    return 0
+    parser.add_argument("archives", type=Path, nargs="+", metavar="WHEEL|SDIST")
+    code = 0
+    for path in parser.parse_args().archives:
+        wrong = faults(path)
+        for fault in wrong:
+            print(f"{path.name}: {fault}", file=sys.stderr)
+        if wrong:
+            code = 1
+        else:
+            print(f"{path.name}: {len(in_archive(path))} files, {path.stat().st_size // 1024} KiB")
+    return code
 
 
 if __name__ == "__main__":

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from sfm_audit.loaders.model import SparseModel
     from sfm_audit.loaders.opening import open_model
 
+__version__: str  # asked of the installed metadata: it stands in pyproject.toml only
+
 __all__ = [
     "AuditConfig",
     "Decision",
@@ -65,15 +67,21 @@ if not all((Path(__file__).parent / room).is_dir() for room in ("audit", "loader
     )
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name from the module it lives in."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
-    value = getattr(module, _RENAMED.get(name, name))
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for Any
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name from the module it lives in."""
+        if name == "__version__":
+            from importlib.metadata import version  # noqa: PLC0415 - costs more than all of this
+
+            return version("sfm-audit")
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+        value = getattr(module, _RENAMED.get(name, name))
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

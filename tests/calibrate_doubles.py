@@ -58,7 +58,7 @@ def fitted(name, estimated, correspondences, rotation, translation, *, distortio
     start = np.concatenate([np.zeros(6), [800.0], np.zeros(len(estimated) - 1)])
     x = least_squares(residuals, start, x_scale="jac", xtol=1e-13, ftol=1e-13, gtol=1e-13).x
     camera, r, t = unpack(x)
-    return estimate_of(name, camera, r, t, correspondences, kept)
+    return estimate_of(name, camera, r, t, correspondences, inliers=kept)
 
 
 def moved(estimate: Estimate, correspondences, shift):
@@ -69,5 +69,5 @@ def moved(estimate: Estimate, correspondences, shift):
         estimate.rotation_cam_from_world,
         estimate.translation_cam_from_world + shift,
         correspondences,
-        estimate.inliers,
+        inliers=estimate.inliers,
     )

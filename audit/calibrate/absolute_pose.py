@@ -61,7 +61,7 @@ def absolute_pose(
     fit = min(fits, key=lambda fit: fit.cost(threshold_px))
     check_consensus(fit.inliers, num_parameters)
     translation = search.points.scale * fit.translation - fit.rotation @ search.points.centroid
-    estimate = estimate_of("colmap", fit.camera, fit.rotation, translation, correspondences, fit.inliers)
+    estimate = estimate_of("colmap", fit.camera, fit.rotation, translation, correspondences, inliers=fit.inliers)
     return check_camera(estimate, correspondences.xyz_world)
 
 

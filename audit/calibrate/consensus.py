@@ -87,7 +87,9 @@ def estimate_radial_camera(
     check_consensus(fit.inliers, num_parameters)
     points = search.points
     translation = points.scale * fit.translation - fit.rotation @ points.centroid
-    estimate = estimate_of(name, search.in_image(fit.camera), fit.rotation, translation, correspondences, fit.inliers)
+    estimate = estimate_of(
+        name, search.in_image(fit.camera), fit.rotation, translation, correspondences, inliers=fit.inliers
+    )
     return check_camera(estimate, correspondences.xyz_world)
 
 

@@ -79,6 +79,7 @@ def estimate_of(
     rotation_cam_from_world: FloatArray,
     translation_cam_from_world: FloatArray,
     correspondences: Correspondences,
+    *,
     inliers: BoolArray,
 ) -> Estimate:
     """Complete an estimate: residuals of all correspondences, covariance from the inliers' robust scale.

@@ -50,11 +50,13 @@ def calibration_row(found: Validation, correspondences: Correspondences, locatio
         "verdict": str(found.verdict),
         **{str(member): found.decision.of(member) for member in MEMBERS},
         "reasons": [str(reason) for reason in found.decision.reasons],
+        "reason_details": found.decision.all_reasons,
     }
 
 
 def degenerate_row(model: str, error: DegenerateInputError, correspondences: Correspondences, location: str) -> Row:
     """Return the row of an estimator that refused: undetermined, and nothing else known."""
+    reasons = degenerate_judgement(error).reasons
     return {
         **dict.fromkeys(schema("calibration").names),
         "correspondences": location,
@@ -63,7 +65,8 @@ def degenerate_row(model: str, error: DegenerateInputError, correspondences: Cor
         "height": correspondences.height,
         "num_correspondences": correspondences.num,
         **dict.fromkeys(("verdict", *map(str, MEMBERS)), Verdict.UNDETERMINED),
-        "reasons": [str(reason) for reason in degenerate_judgement(error).reasons],
+        "reasons": [str(reason) for reason in reasons],
+        "reason_details": reasons,
     }
 
 

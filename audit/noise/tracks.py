@@ -73,24 +73,15 @@ def track_statistics(
     length = np.bincount(point_idx, minlength=num_points)
     inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
     projected, complement, removable = _project_off_points(residuals_px, point_jacobian, point_idx, inverse)
-    square = np.empty(n)
-    for part in _chunks(n):
-        np.multiply(projected[0, part], projected[0, part], out=square[part])
-        square[part] += projected[1, part] * projected[1, part]
+    square = _squared_lengths(projected)
     track_sq = sum_by_point(square, point_idx, num_points)
-
-    whitened, verified, other_sq = projected, np.empty(n, dtype=bool), square  # what is read is not needed again
     track_length = length.take(point_idx)
+    verified = differentiable & (track_length >= min_track_length)
     for part in _chunks(n):
-        smallest, x, y = _inverse_root_times(complement[:, part], projected[:, part])
-        good = (track_length[part] >= min_track_length) & (smallest >= min_eigenvalue) & differentiable[part]
-        verified[part] = good
-        other = np.maximum(track_sq.take(point_idx[part]) - (x * x + y * y), 0.0)  # (3)
-        whitened[0, part] = np.where(good, x, np.nan)
-        whitened[1, part] = np.where(good, y, np.nan)
-        other_sq[part] = np.where(good, other, np.nan)
+        square[part] = track_sq.take(point_idx[part])
+    other_sq = _whiten_in_place(projected, verified, complement, square, min_eigenvalue)
     return TrackStatistics(
-        whitened,
+        projected,
         verified,
         track_length,
         other_sq,
@@ -98,6 +89,33 @@ def track_statistics(
         removable,
         sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(n)),
     )
+
+
+def _squared_lengths(vectors: FloatArray) -> FloatArray:
+    """Squared lengths (n,) of vectors (2, n)."""
+    square = np.empty(vectors.shape[1])
+    for part in _chunks(len(square)):
+        np.multiply(vectors[0, part], vectors[0, part], out=square[part])
+        square[part] += vectors[1, part] * vectors[1, part]
+    return square
+
+
+def _whiten_in_place(
+    projected: FloatArray, verified: BoolArray, complement: FloatArray, track_sq: FloatArray, min_eigenvalue: float
+) -> FloatArray:
+    """Whiten ``projected`` (2, n), clear ``verified`` (n,) where I - H is too small; return ``track_sq`` (n,) as (3).
+
+    Arrays of the size of a model: each is written where it was read.
+    """
+    for part in _chunks(len(track_sq)):
+        smallest, x, y = _inverse_root_times(complement[:, part], projected[:, part])
+        good = verified[part] & (smallest >= min_eigenvalue)
+        verified[part] = good
+        other = np.maximum(track_sq[part] - (x * x + y * y), 0.0)  # (3)
+        projected[0, part] = np.where(good, x, np.nan)
+        projected[1, part] = np.where(good, y, np.nan)
+        track_sq[part] = np.where(good, other, np.nan)
+    return track_sq
 
 
 def _finite_columns(point_jacobian: FloatArray) -> BoolArray:

@@ -83,20 +83,11 @@ def normality_tests(z: FloatArray) -> NormalityTests:
     dap = dagostino_pearson_from_shape(shape, len(values))
     thinned = values_sorted if len(values) <= MAX_VALUES else np.sort(thin_observations(z), axis=None)
     sw = shapiro_wilk_sorted(thinned)
+    ran = {"ks": plain, "ks_fitted": fitted, "ks_norm": norm, "ks_norm_unscaled": norm_unscaled, "dap": dap, "sw": sw}
     return NormalityTests(
         num_values=len(values),
-        ks_stat=plain.statistic,
-        ks_p=plain.p,
-        ks_fitted_stat=fitted.statistic,
-        ks_fitted_p=fitted.p,
-        ks_norm_stat=norm.statistic,
-        ks_norm_p=norm.p,
-        ks_norm_unscaled_stat=norm_unscaled.statistic,
-        ks_norm_unscaled_p=norm_unscaled.p,
-        dap_stat=dap.statistic,
-        dap_p=dap.p,
-        sw_stat=sw.statistic,
-        sw_p=sw.p,
+        **{f"{name}_stat": outcome.statistic for name, outcome in ran.items()},
+        **{f"{name}_p": outcome.p for name, outcome in ran.items()},
         sw_num_values=0 if math.isnan(sw.p) else len(thinned),
         skewness=shape.skewness,
         kurtosis_excess=shape.kurtosis_excess,

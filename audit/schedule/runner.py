@@ -6,7 +6,7 @@ own files and the config.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import Protocol
@@ -76,8 +76,7 @@ def audit_many(
     Returns
     -------
     list of Failure
-        Models that could not be read, or whose process died twice, in the order of ``refs``. Their earlier tables are
-        removed from the sink.
+        In the order of ``refs``: could not be read, or the process died twice. The sink drops their earlier tables.
 
     Raises
     ------
@@ -86,26 +85,43 @@ def audit_many(
     """
     failures: dict[str, Failure] = {}
     tasks = []
+    for ref, digest in _unfinished(refs, sink, on_skip or on_done):
+        if max_model_bytes is not None and ref.num_bytes > max_model_bytes:
+            failures[ref.key] = too_large(ref, max_model_bytes)
+            sink.drop(ref.key)
+            on_done(ref)
+        else:
+            tasks.append(Task(ref, config, digest, observations))
+    with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
+        failures |= _hand_over(outcomes, sink, on_done)
+    return [failures[ref.key] for ref in refs if ref.key in failures]
+
+
+def _unfinished(
+    refs: Sequence[ModelRef], sink: Sink, on_skip: Callable[[ModelRef], None]
+) -> Iterator[tuple[ModelRef, str | None]]:
+    """Models that need an audit, each with the digest of the input that it was finished with, None if it never was."""
     for ref in refs:
         known = sink.finished(ref)
         if known is not None and _is_untouched(ref, known):
-            (on_skip or on_done)(ref)
+            on_skip(ref)
         else:
-            if max_model_bytes is not None and ref.num_bytes > max_model_bytes:
-                failures[ref.key] = too_large(ref, max_model_bytes)
-                sink.drop(ref.key)
-                on_done(ref)
-                continue
-            tasks.append(Task(ref, config, known.digest if known else None, observations))
-    with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
-        for task, outcome in outcomes:
-            if isinstance(outcome, Failure):
-                failures[task.ref.key] = outcome
-                sink.drop(task.ref.key)
-            elif isinstance(outcome, Audited):
-                sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
-            on_done(task.ref)
-    return [failures[ref.key] for ref in refs if ref.key in failures]
+            yield ref, known.digest if known else None
+
+
+def _hand_over(
+    outcomes: Iterable[tuple[Task, Outcome]], sink: Sink, on_done: Callable[[ModelRef], None]
+) -> dict[str, Failure]:
+    """Hand each model's tables to the sink as it is finished; return the failures, whose earlier tables it drops."""
+    failures = {}
+    for task, outcome in outcomes:
+        if isinstance(outcome, Failure):
+            failures[task.ref.key] = outcome
+            sink.drop(task.ref.key)
+        elif isinstance(outcome, Audited):
+            sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
+        on_done(task.ref)
+    return failures
 
 
 def _outcomes(

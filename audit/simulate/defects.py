@@ -140,10 +140,11 @@ def displacement_px(
 def systematic_rms_px(
     claimed: CameraModel,
     params: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
     xyz_world: FloatArray,
     xy_px: FloatArray,
+    *,
+    rotation: FloatArray,
+    translation: FloatArray,
 ) -> float:
     """Return the RMS length, px, that remains of xy - projection after refitting one image to noise-free points.
 
@@ -202,6 +203,7 @@ def values_of_size(
     size_px: float,
     kind: DefectKind,
     values: tuple[float, ...],
+    *,
     claimed: CameraModel,
     cameras: TrueCameras,
     image_idx: int,
@@ -212,7 +214,7 @@ def values_of_size(
     ValueError when the claimed camera explains the defect, so that no value has that size.
     """
     for _ in range(_MAX_SIZING_STEPS):
-        size = defect_size_px(kind, values, claimed, cameras, image_idx, xyz_world)
+        size = defect_size_px(kind, values, claimed=claimed, cameras=cameras, image_idx=image_idx, xyz_world=xyz_world)
         if not size > _ABSORBED:
             raise ValueError(f"{claimed.name} explains {kind} in image {image_idx}: it cannot be {size_px} px wrong")
         if abs(size / size_px - 1.0) < _SIZING_TOLERANCE:
@@ -225,6 +227,7 @@ def values_of_size(
 def defect_size_px(
     kind: DefectKind,
     values: tuple[float, ...],
+    *,
     claimed: CameraModel,
     cameras: TrueCameras,
     image_idx: int,
@@ -241,10 +244,10 @@ def defect_size_px(
     return systematic_rms_px(
         claimed,
         claimed_params_of(claimed, cameras.params)[image_idx],
-        cameras.rotation_cam_from_world[image_idx],
-        cameras.translation_cam_from_world[image_idx],
         xyz_world,
         xy_px,
+        rotation=cameras.rotation_cam_from_world[image_idx],
+        translation=cameras.translation_cam_from_world[image_idx],
     )
 
 

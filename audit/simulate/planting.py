@@ -105,7 +105,14 @@ def planted_defects(planting: Planting, tracks: Tracks, names: tuple[str, ...]) 
         if spec.kind is DefectKind.FEW_POINTS:
             final = (float(len(seen)), values[1])
         else:
-            size = defect_size_px(spec.kind, values, planting.claimed, planting.sound, spec.image_idx, seen)
+            size = defect_size_px(
+                spec.kind,
+                values,
+                claimed=planting.claimed,
+                cameras=planting.sound,
+                image_idx=spec.image_idx,
+                xyz_world=seen,
+            )
         words = words_of(spec.kind, final, size)
         records.append(PlantedDefect(spec.image_idx, names[spec.image_idx], spec.kind, final, size, words))
     return tuple(sorted(records, key=lambda record: record.image_idx))
@@ -124,7 +131,15 @@ def _sized(
 ) -> tuple[float, ...]:
     if spec.kind is DefectKind.FEW_POINTS:
         return values
-    return values_of_size(spec.size_px, spec.kind, values, claimed, sound, spec.image_idx, xyz_world)
+    return values_of_size(
+        spec.size_px,
+        spec.kind,
+        values,
+        claimed=claimed,
+        cameras=sound,
+        image_idx=spec.image_idx,
+        xyz_world=xyz_world,
+    )
 
 
 def _points_seen(tracks: Tracks, image_idx: int) -> FloatArray:

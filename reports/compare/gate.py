@@ -201,7 +201,7 @@ def _limit_checks(scope: Scope, limits: Limits, numbers: ScopeNumbers, change: S
         if allowed is None:
             continue
         images = lost if name == "max_lost_images" else ()
-        yield _limit_check(scope, name, allowed, value, show, images)
+        yield _limit_check(scope, name, allowed, value, show=show, images=images)
 
 
 def _limit_check(
@@ -209,6 +209,7 @@ def _limit_check(
     name: str,
     allowed: float,
     value: float | None,
+    *,
     show: Callable[[float], str],
     images: Noted,
 ) -> Check:

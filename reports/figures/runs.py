@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, Protocol
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
@@ -97,32 +98,32 @@ def histogram_by_verdict(
     base = np.zeros(_BINS)
     for name, colour in VERDICT_COLOURS.items():
         height, _ = np.histogram(shown[usable & (verdict == name)], edges)
-        axes.bar(
-            edges[:-1],
-            height,
-            np.diff(edges),
-            base,
-            align="edge",
-            color=colour,
-            hatch=VERDICT_HATCHES[name],
-            edgecolor="#ffffff",
-            linewidth=0.2,
-            label=name,
-        )
+        look: dict[str, Any] = {
+            "color": colour,
+            "hatch": VERDICT_HATCHES[name],
+            "edgecolor": "#ffffff",
+            "linewidth": 0.2,
+        }
+        axes.bar(edges[:-1], height, np.diff(edges), base, align="edge", label=name, **look)
         base += height
     for name, at in (marks or {}).items():
         axes.axvline(at, color=INK, linewidth=0.8, linestyle="--", label=name)
     if log:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.xaxis.set_minor_locator(NullLocator())
+        _span_decades(axes)
     missing = int(np.count_nonzero(~usable))
     axes.set_title(f"{int(usable.sum())} images" + (f", {missing} without the number" if missing else ""))
     axes.set_xlabel(label)
     axes.set_ylabel("images")
     figure.legend(loc="outside upper left", ncols=2)
     return figure
+
+
+def _span_decades(axes: Axes) -> None:
+    """Make the axis of values logarithmic, with plain numbers at 1, 2 and 5."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 @styled

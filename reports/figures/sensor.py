@@ -187,7 +187,14 @@ def _image_axes(residuals: Residuals, space_in: float = 0.0) -> tuple[Figure, Ax
 
 
 def _arrows(
-    axes: Axes, at: FloatArray, vector: FloatArray, factor: float, colour: str, width: float = 0.003, edge: str = "none"
+    axes: Axes,
+    at: FloatArray,
+    vector: FloatArray,
+    factor: float,
+    colour: str,
+    *,
+    width: float = 0.003,
+    edge: str = "none",
 ) -> None:
     axes.quiver(
         *at.T,

@@ -121,7 +121,9 @@ def power_trials(kind: DefectKind, n: int, first: int, last: int, seed: int) -> 
         rng = np.random.default_rng([seed, _SEED_POWER, list(DefectKind).index(kind), n, trial])
         xyz, camera = draw_points(n, rng), sound_camera()
         size = float(np.exp(rng.uniform(np.log(0.03), np.log(1.2))))
-        values = values_of_size(size, kind, random_values(kind, rng), CLAIMED, camera, 0, xyz)
+        values = values_of_size(
+            size, kind, random_values(kind, rng), claimed=CLAIMED, cameras=camera, image_idx=0, xyz_world=xyz
+        )
         rows.append({"kind": str(kind), "n": n, "true_px": size, **row_of(_defective(kind, values, xyz, rng))})
     return pd.DataFrame(rows)
 
@@ -132,7 +134,7 @@ def exact_trials(kind: DefectKind, first: int, last: int, seed: int, n: int = 25
     for trial in range(first, last):
         rng = np.random.default_rng([seed, _SEED_EXACT, list(DefectKind).index(kind), n, trial])
         xyz, values = draw_points(n, rng), EXACT_DEFECTS[kind]
-        size = defect_size_px(kind, values, CLAIMED, sound_camera(), 0, xyz)
+        size = defect_size_px(kind, values, claimed=CLAIMED, cameras=sound_camera(), image_idx=0, xyz_world=xyz)
         rows.append({"kind": str(kind), "n": n, "true_px": size, **row_of(_defective(kind, values, xyz, rng))})
     return pd.DataFrame(rows)
 

@@ -42,7 +42,7 @@ def fitted_tests(true, rng, n=250, claimed="SIMPLE_RADIAL"):
     start = camera(claimed, (-0.05,))
     xy = xy_true + SIGMA_PX * rng.standard_normal((n, 2))
     fitted, xyz_cam = refit(start, xyz, xy)
-    truth = systematic_rms_px(start.model, start.params, np.eye(3), np.zeros(3), xyz, xy_true)
+    truth = systematic_rms_px(start.model, start.params, xyz, xy_true, rotation=np.eye(3), translation=np.zeros(3))
     return prepare_image(fitted, xyz_cam).test(residuals_of(fitted, xyz_cam, xy)), truth
 
 

@@ -152,7 +152,7 @@ def test_a_camera_that_folds_or_looks_away_is_none():
             arguments["rotation"],
             arguments["translation"],
             correspondences,
-            arguments["inliers"],
+            inliers=arguments["inliers"],
         )
         return check_camera(estimate, correspondences.xyz_world)
 

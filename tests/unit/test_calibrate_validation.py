@@ -98,7 +98,7 @@ def test_the_world_s_unit_and_frame_do_not_matter(scale, turn):
     r = estimate.rotation_cam_from_world @ rotation.T
     t = scale * (estimate.translation_cam_from_world - r @ shift)
     other = dataclasses.replace(correspondences, xyz_world=world)
-    there = validate(estimate_of("D1", estimate.camera, r, t, other, estimate.inliers), other)
+    there = validate(estimate_of("D1", estimate.camera, r, t, other, inliers=estimate.inliers), other)
     for group, test in here.tests.items():
         assert_allclose(there.tests[group].p, test.p, rtol=1e-5)
     assert_allclose(there.identifiability.sd_focal_rel, here.identifiability.sd_focal_rel, rtol=1e-6)
@@ -143,7 +143,7 @@ def test_too_few_and_too_exact():
     assert found.verdict == UNDETERMINED
     assert codes(found.judgement) == [ReasonCode.TOO_FEW_OBSERVATIONS]
     exact, rotation, translation = board(np.random.default_rng(0), noise_px=0.0)
-    estimate = estimate_of("D3", true_camera(), rotation, translation, exact, np.ones(exact.num, dtype=bool))
+    estimate = estimate_of("D3", true_camera(), rotation, translation, exact, inliers=np.ones(exact.num, dtype=bool))
     found = validate(estimate, exact)
     assert found.decision.of(Member.KS) == found.decision.of(Member.MISFIT) == UNDETERMINED
     assert ReasonCode.EXACT_PROJECTIONS in codes(found.judgement)
@@ -176,7 +176,7 @@ def test_the_plain_scale_hides_what_the_robust_one_shows():
             estimate.rotation_cam_from_world,
             estimate.translation_cam_from_world,
             spoilt,
-            estimate.inliers,
+            inliers=estimate.inliers,
         ),
         spoilt,
     )

@@ -51,7 +51,7 @@ def scanned(rng, num, sigma_d_px, sigma_l, *, offset=(0.3, 0.2, 0.0), camera=CAM
         on_sphere(pan + PAN_STEP, tilt, radius),
         on_sphere(pan, tilt + TILT_STEP, radius),
     )
-    return estimate_of("truth", camera, TURN, translation, measured, np.ones(num, dtype=bool)), measured
+    return estimate_of("truth", camera, TURN, translation, measured, inliers=np.ones(num, dtype=bool)), measured
 
 
 def standard_errors(a_sq, theta):
@@ -201,12 +201,12 @@ def test_a_neighbour_behind_the_camera_is_left_out_of_the_fit():
 def test_only_inliers_count():
     estimate, measured = scanned(np.random.default_rng(4), 300, 0.3, 0.2)
     kept = np.arange(300) % 3 > 0
-    part = estimate_of("truth", CAMERA, TURN, estimate.translation_cam_from_world, measured, kept)
+    part = estimate_of("truth", CAMERA, TURN, estimate.translation_cam_from_world, measured, inliers=kept)
     assert lidar_noise(part, measured).z.shape == (200, 2)
     some = [values[kept] for values in (measured.xy_px, measured.xyz_world)]
     some += [values[kept] for values in (measured.pan_xyz_world, measured.tilt_xyz_world)]
     alone, less = Correspondences(1600, 1200, *some), np.ones(200, dtype=bool)
-    same = estimate_of("truth", CAMERA, TURN, estimate.translation_cam_from_world, alone, less)
+    same = estimate_of("truth", CAMERA, TURN, estimate.translation_cam_from_world, alone, inliers=less)
     assert_allclose(lidar_noise(part, measured).z, lidar_noise(same, alone).z)
 
 
@@ -240,7 +240,7 @@ def test_from_a_scan_in_ptx_and_a_table_to_sigma_l(tmp_path):
     text = "".join(",".join(f"{value:.5f}" for value in row) + "\n" for row in table)
     (tmp_path / "points.csv").write_text("# width=1600 height=1200\nx,y,X,Y,Z\n" + text)
     measured = read_correspondences(tmp_path / "points.csv", scan=read_ptx(tmp_path / "scan.ptx"))
-    estimate = estimate_of("truth", CAMERA, TURN, np.zeros(3), measured, np.ones(2000, dtype=bool))
+    estimate = estimate_of("truth", CAMERA, TURN, np.zeros(3), measured, inliers=np.ones(2000, dtype=bool))
     noise = lidar_noise(estimate, measured)
     assert noise.sigma_l == pytest.approx(sigma_l, rel=0.1)
     assert noise.sigma_d_px == pytest.approx(sigma_d, rel=0.25)
