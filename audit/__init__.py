@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
     from sfm_audit.audit.decision.decide import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
-    from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor, audit_model
+    from sfm_audit.audit.engine.model import ModelAuditor, audit_model
+    from sfm_audit.audit.engine.tables import ModelAudit
     from sfm_audit.audit.table import ModelLabels
     from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
 
@@ -32,7 +33,8 @@ __all__ = [
 
 _HOMES: Final = {
     "sfm_audit.audit.config": ("AuditConfig",),
-    "sfm_audit.audit.engine.model": ("ModelAudit", "ModelAuditor", "audit_model"),
+    "sfm_audit.audit.engine.model": ("ModelAuditor", "audit_model"),
+    "sfm_audit.audit.engine.tables": ("ModelAudit",),
     "sfm_audit.audit.engine.image": ("ImageAudit", "audit_inliers"),
     "sfm_audit.audit.table": ("ModelLabels",),
     "sfm_audit.audit.decision.decide": ("Decision",),

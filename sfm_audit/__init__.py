@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
     from sfm_audit.audit.decision.decide import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
-    from sfm_audit.audit.engine.model import ModelAudit, ModelAuditor
+    from sfm_audit.audit.engine.model import ModelAuditor
     from sfm_audit.audit.engine.model import audit_model as audit_reconstruction
+    from sfm_audit.audit.engine.tables import ModelAudit
     from sfm_audit.audit.table import ModelLabels
     from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
     from sfm_audit.loaders.errors import LoadError
@@ -47,7 +48,7 @@ _HOMES: Final = {
     "ImageAudit": "audit.engine.image",
     "Decision": "audit.decision.decide",
     "LoadError": "loaders.errors",
-    "ModelAudit": "audit.engine.model",
+    "ModelAudit": "audit.engine.tables",
     "ModelAuditor": "audit.engine.model",
     "ModelLabels": "audit.table",
     "Reason": "audit.table.words",

@@ -22,7 +22,7 @@ from sfm_audit.loaders.correspondences.records import Correspondences
 
 Row = dict[str, Any]
 
-MEMBERS: Final = (Member.KS, Member.MISFIT, Member.POSE, Member.PLAUSIBLE)
+MEMBERS: Final = (Member.KS, Member.MISFIT, Member.POSE, Member.PLAUSIBLE, Member.NOISE)
 """The questions that are asked of an estimate."""
 
 

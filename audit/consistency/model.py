@@ -53,6 +53,11 @@ class ModelConsistency:
     parts_disagree: bool
     points_behind: bool
 
+    @property
+    def half_pixel(self) -> bool:
+        """Whether half a pixel lies between the 2D points and the cameras of most images."""
+        return any(finding.code is ConsistencyCode.PIXEL_CONVENTION for finding in self.findings)
+
 
 def consistency_of(model: SparseModel, limits: ConsistencyLimits = DEFAULT_LIMITS) -> ModelConsistency:
     """Ask all images of a model, in file order, and the model."""

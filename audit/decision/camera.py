@@ -26,7 +26,7 @@ def judge_camera(diagnostics: Diagnostics, settings: AuditConfig) -> Judgement |
     if consistency.inconsistent:
         text, rms_px = consistency.text, consistency.rms_px
         return Judgement(Verdict.REJECTED, (Reason(ReasonCode.INCONSISTENT, member, text, rms_px, None, "px"),))
-    unknown = too_few(member, "inliers", diagnostics.num_inliers, settings) or exact_projections(member, diagnostics)
+    unknown = exact_projections(member, diagnostics) or too_few(member, "inliers", diagnostics.num_inliers, settings)
     if unknown is not None:
         return undetermined(unknown)
     return _judge_own(diagnostics, settings) if diagnostics.has_own else Judgement(Verdict.ACCEPTED)

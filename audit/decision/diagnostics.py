@@ -193,6 +193,7 @@ class Diagnostics:
     largest_residual_px, longer_side_px: 2D points whose residuals are rounding were not measured.
     misfit, camera: None without inliers.    remarks: reasons that decide nothing, found elsewhere.
     consistency, own, gains: None where nobody asked; has_own: whether the camera has own parameters to ask for.
+    half_pixel: its 2D points, and those of most images, are shifted by half a pixel (finding pixel_convention).
     """
 
     num_inliers: int
@@ -208,3 +209,4 @@ class Diagnostics:
     own: OwnDiagnostics | None = None
     has_own: bool = False
     gains: Gains | None = None
+    half_pixel: bool = False

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.diagnostics import CameraDiagnostics, Diagnostics
 from sfm_audit.audit.decision.misfit import MisfitDecision
-from sfm_audit.audit.table.thresholds import EXACT_SHARE, KS_CRITICAL
+from sfm_audit.audit.table.thresholds import EXACT_SHARE, HALF_PIXEL_SHIFT_PX, KS_CRITICAL
 from sfm_audit.audit.table.words import MISFIT_CODES, Member, MisfitGroup, Reason, ReasonCode, Verdict
 
 
@@ -39,7 +39,7 @@ def too_few(member: Member, what: str, num: int, settings: AuditConfig) -> Reaso
 def exact_projections(member: Member, diagnostics: Diagnostics) -> Reason | None:
     """Return what makes the 2D points no measurements; None where they are."""
     limit = EXACT_SHARE * diagnostics.longer_side_px
-    if not diagnostics.largest_residual_px <= limit:
+    if not diagnostics.num_inliers or not diagnostics.largest_residual_px <= limit:
         return None
     text = f"largest residual {diagnostics.largest_residual_px:.2g} px"
     return Reason(ReasonCode.EXACT_PROJECTIONS, member, text, diagnostics.largest_residual_px, limit, "px")
@@ -67,8 +67,10 @@ def judge_noise(diagnostics: Diagnostics, settings: AuditConfig) -> Judgement:
         return undetermined(unknown)
     excess = noise.ks_stat - KS_CRITICAL / math.sqrt(2 * noise.num_standardised)
     limit = settings.max_noise_distance
+    text = f"D - {KS_CRITICAL:g} / sqrt(N) = {excess:.3f} > {limit:g}, N = {2 * noise.num_standardised}"
+    if excess > limit and diagnostics.half_pixel:
+        return Judgement(Verdict.ACCEPTED, (Reason(ReasonCode.PIXEL_CONVENTION, member, text, excess, limit, "1"),))
     if excess > limit:
-        text = f"D - {KS_CRITICAL:g} / sqrt(N) = {excess:.3f} > {limit:g}, N = {2 * noise.num_standardised}"
         return Judgement(Verdict.REJECTED, (Reason(ReasonCode.NOISE_DIFFERS, member, text, excess, limit, "1"),))
     return Judgement(Verdict.ACCEPTED)
 
@@ -77,12 +79,9 @@ def _no_standardised(member: Member, diagnostics: Diagnostics, settings: AuditCo
     """Return why nothing can be said of the noise; None where something can."""
     noise, num_inliers = diagnostics.noise, diagnostics.num_inliers
     what = "inliers" if noise.num_standardised == num_inliers else f"standardised of {num_inliers} inliers"
-    few = too_few(member, what, noise.num_standardised, settings)
-    if few is not None:
-        return few
-    exact = exact_projections(member, diagnostics)
-    if exact is not None or noise.is_fitted:
-        return exact
+    unknown = exact_projections(member, diagnostics) or too_few(member, what, noise.num_standardised, settings)
+    if unknown is not None or noise.is_fitted:
+        return unknown
     num = noise.num_standardised
     return Reason(ReasonCode.NOISE_NOT_FITTED, member, f"{num} observations", num, None, "count")
 
@@ -98,7 +97,7 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
         few = too_few(member, "inliers", diagnostics.num_inliers, settings)
         return undetermined(*([few] if few else []))
     what = "inliers" if misfit.num_tested == diagnostics.num_inliers else f"clean of {diagnostics.num_inliers} inliers"
-    unknown = too_few(member, what, misfit.num_tested, settings) or exact_projections(member, diagnostics)
+    unknown = exact_projections(member, diagnostics) or too_few(member, what, misfit.num_tested, settings)
     if unknown is not None:
         return undetermined(unknown)
     remarks = _not_tested(found)
@@ -155,6 +154,9 @@ def judge_pose(diagnostics: Diagnostics, settings: AuditConfig) -> Judgement:
         text = f"pose offset unknown, {num} inliers"
         return undetermined(Reason(ReasonCode.NON_FINITE_DERIVATIVES, member, text, num, None, "count"))
     limit = settings.pose_offset_threshold_px
+    if diagnostics.half_pixel and limit < offset <= limit + HALF_PIXEL_SHIFT_PX:
+        text = f"pose_offset_px = {offset:.3g}, of which half a pixel in x and y explains {HALF_PIXEL_SHIFT_PX:.2g}"
+        return Judgement(Verdict.ACCEPTED, (Reason(ReasonCode.PIXEL_CONVENTION, member, text, offset, limit, "px"),))
     if offset > limit:
         text = f"pose_offset_px = {offset:.3g} > {limit:g}"
         return Judgement(Verdict.REJECTED, (Reason(ReasonCode.POSE_NOT_OPTIMAL, member, text, offset, limit, "px"),))

@@ -43,7 +43,8 @@ class ImageEvidence:
     quality, misfit: of the camera, and the tests on which the verdict rests; both None without inliers.
     retest: tries another camera model on the residuals of those tests.
     camera: the numbers of the camera that decide; those of ``quality`` where None.
-    consistency, own, has_own, gains: see `Diagnostics`.    expected_error_px: with the joint covariance, NaN unknown.
+    consistency, own, has_own, gains, half_pixel: see `Diagnostics`.
+    expected_error_px: with the joint covariance, NaN unknown.
     implied: changes that parameters which nobody freed would take, by column.
     """
 
@@ -61,6 +62,7 @@ class ImageEvidence:
     own: OwnDiagnostics | None = None
     has_own: bool = False
     gains: Gains | None = None
+    half_pixel: bool = False
     expected_error_px: float = math.nan
     implied: Mapping[str, float] = field(default_factory=dict)
 
@@ -210,6 +212,7 @@ def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
         own=evidence.own,
         has_own=evidence.has_own,
         gains=evidence.gains,
+        half_pixel=evidence.half_pixel,
     )
 
 

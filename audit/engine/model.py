@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any, Protocol, TypeVar
 
@@ -31,15 +30,15 @@ from sfm_audit.audit.engine.jointly import (
 )
 from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
+from sfm_audit.audit.engine.tables import ModelAudit, images_table, table_of
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
 from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
-from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
 from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
-from sfm_audit.audit.table import ModelLabels, TableName, build_table, empty_table, schema
+from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.words import MisfitStatus, ReasonCode
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
@@ -58,25 +57,6 @@ class Spread(Protocol):
 def in_turn(function: Callable[[ModelAuditor, range], list[T]], auditor: ModelAuditor) -> list[T]:
     """One image after the other, in this process."""
     return function(auditor, range(len(auditor.model.images)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ModelAudit:
-    """The tables of one model, as written to a run folder: a row per image, per camera, per model.
-
-    observations: a row per inlier; None unless it was asked for.
-    """
-
-    images: pa.Table
-    cameras: pa.Table
-    models: pa.Table
-    observations: pa.Table | None = None
-
-    @property
-    def tables(self) -> dict[str, pa.Table]:
-        """The tables by name."""
-        tables = {"images": self.images, "cameras": self.cameras, "models": self.models}
-        return tables if self.observations is None else {**tables, "observations": self.observations}
 
 
 class ModelAuditor:
@@ -273,6 +253,7 @@ class ModelAuditor:
             consistency=consistency_diagnostics(
                 self.consistency.images[image_idx], all_behind=self.consistency.points_behind
             ),
+            half_pixel=self.consistency.half_pixel and bool(self.consistency.images[image_idx].half_pixel),
             **self._of_camera(image_idx),
         )
         return audit_image(evidence, self.config)
@@ -352,9 +333,9 @@ class ModelAuditor:
         findings = [*self.model.findings, *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(
-            _images_table(rows),
-            _table("cameras", [self._camera_row(camera, labels) for camera in self.cameras]),
-            _table("models", [row]),
+            images_table(rows),
+            table_of("cameras", [self._camera_row(camera, labels) for camera in self.cameras]),
+            table_of("models", [row]),
             self.observations(labels) if observations else None,
         )
 
@@ -419,17 +400,3 @@ def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) ->
     """Rows of the image table and decisions about some images."""
     audits = map(auditor.image, image_idxs)
     return [(image_row(audit, labels, auditor.config.noise), audit.decision) for audit in audits]
-
-
-def _images_table(rows: Sequence[Row]) -> pa.Table:
-    if rows:
-        q = benjamini_hochberg(np.array([row["ks_p"] for row in rows], dtype=np.float64))
-        for row, value in zip(rows, q, strict=True):
-            row["ks_q"] = value
-    return _table("images", rows)
-
-
-def _table(name: TableName, rows: Sequence[Row]) -> pa.Table:
-    if not rows:
-        return empty_table(name)
-    return build_table({column: [row[column] for row in rows] for column in rows[0]}, schema(name))

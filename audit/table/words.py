@@ -163,6 +163,7 @@ class ReasonCode(StrEnum):
     CAMERA_NOT_TESTED = "camera_not_tested"
     MISFIT_WITHOUT_WORTH = "misfit_without_worth"
     NOISE_DIFFERS = "noise_differs"
+    PIXEL_CONVENTION = "pixel_convention"
     DEGENERATE_INPUT = "degenerate_input"
 
 
@@ -289,6 +290,10 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
     ),
     ReasonCode.NOISE_DIFFERS: _rejects(
         "the noise is visibly another one: D - 1.36 / sqrt(N), its limit, number of values", Member.NOISE
+    ),
+    ReasonCode.PIXEL_CONVENTION: _remarks(
+        "half a pixel between 2D points and cameras in all images explains it (decides nothing): which number",
+        *(Member.POSE, Member.NOISE),
     ),
     ReasonCode.DEGENERATE_INPUT: _leaves_open(
         "the correspondences determine no camera: in which way, and the number that says so", *_ALL, note="of calibrate"
