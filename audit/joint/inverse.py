@@ -137,8 +137,9 @@ class _Factor:
 
 def _dense(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> FloatArray:
     """S with unit diagonal plus Z Z^T; 1 on the diagonal of dead columns. In Fortran order, for LAPACK."""
-    inverse_scale = sparse.dia_array((1.0 / scale[None], [0]), shape=matrix.shape)
-    out = (inverse_scale @ matrix @ inverse_scale).toarray().T  # symmetric: the transpose is in Fortran order
+    data = matrix.data / scale[matrix.indices] / np.repeat(scale, np.diff(matrix.indptr))
+    scaled = sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+    out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
     if dead.any():
         out[dead] = 0.0
         out[:, dead] = 0.0

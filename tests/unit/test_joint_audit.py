@@ -10,7 +10,7 @@ from joint_reference import SPEC, model_of, with_param
 from numpy.testing import assert_allclose
 
 from audit.engine import ModelAuditor
-from audit.joint import JointStatus, audit_jointly, covisible_blocks
+from audit.joint import CameraStep, JointStatus, audit_jointly, covisible_blocks
 from audit.joint.own import _implied_focal
 
 CHAIN = dataclasses.replace(SPEC, num_images=30, points_per_image=150, max_neighbours=6)
@@ -90,3 +90,34 @@ def test_implied_focal_undoes_the_linearisation(true, depth):
 
 def test_implied_focal_without_an_answer_is_the_linear_one():
     assert _implied_focal(1000.0, 900.0, 1.9) == 1900.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "material"),
+    [
+        ({}, True),
+        ({"own_step_px": 0.19}, False),
+        ({"plain_step_px": 0.19}, False),
+        ({"plain_step": np.array([-60.0, 0.0])}, False),
+        ({"plain_step": np.array([4.9, 0.0])}, False),
+        ({"step": np.array([4.9, 0.0])}, False),
+        ({"sd": np.array([np.nan, 1.0])}, False),
+    ],
+)
+def test_a_step_is_material_if_both_say_so(changes, material):
+    step = CameraStep(
+        camera_idx=0,
+        image_idxs=np.arange(3),
+        num_observations=100,
+        names=("f", "k"),
+        stored=np.array([1000.0, 0.0]),
+        step=np.array([50.0, 0.0]),
+        sd=np.array([1.0, 1.0]),
+        plain_step=np.array([60.0, 0.0]),
+        own_step_px=0.21,
+        plain_step_px=0.21,
+        sd_focal_rel=0.001,
+        focal_identified=True,
+        implied=np.array([1050.0, 0.0]),
+    )
+    assert dataclasses.replace(step, **changes).is_material(0.2) is material
