@@ -121,3 +121,12 @@ def test_a_step_is_material_if_both_say_so(changes, material):
         implied=np.array([1050.0, 0.0]),
     )
     assert dataclasses.replace(step, **changes).is_material(0.2) is material
+
+
+def test_a_model_without_usable_images_says_nothing(chain):
+    found = audited(chain, left_out=np.ones(30, dtype=bool))
+    assert found.steps == ()
+    assert found.implied == []
+    assert np.isnan(found.misfit.effect_px).all()
+    assert not found.misfit.most_are_wrong
+    assert all(np.isnan(gains.both) for gains in found.gains)
