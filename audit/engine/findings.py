@@ -10,6 +10,7 @@ from sfm_audit.audit.consistency import ModelConsistency
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, stale_finding
 from sfm_audit.audit.joint import JointAudit
 from sfm_audit.audit.noise.standardise import ModelTracks
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
 _REMOVABLE_SHARE: Final = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
@@ -47,13 +48,17 @@ def consistency_findings(consistency: ModelConsistency) -> list[Finding]:
     return [Finding(FindingCode(found.code.value), found.count, found.text) for found in consistency.findings]
 
 
-def joint_findings(model: SparseModel, joint: JointAudit | None) -> list[Finding]:
-    """Return parameters that nobody freed and that the joint system implies, and how it was solved."""
+def joint_findings(model: SparseModel, joint: JointAudit | None, tau_px: FloatArray) -> list[Finding]:
+    """Return parameters that nobody freed and that the joint system implies, and how it was solved.
+
+    tau_px : (I,) materiality, px
+    """
     if joint is None:
         return []
     out = []
+    wrong = joint.misfit.effect_px > tau_px  # what such an image implies for its neighbours' cameras is its own error
     for one in joint.implied:
-        if one.found:
+        if one.found and not wrong[one.image_idxs].any():
             images = len(one.image_idxs)
             whose = "all cameras of one size"
             if one.camera_idx is not None:

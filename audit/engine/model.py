@@ -329,7 +329,7 @@ class ModelAuditor:
             for decision in decisions
         )
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
-        own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint)]
+        own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(

@@ -100,6 +100,10 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     eigenvectors and 1 on G, and its inverse minus G G^T is S^+. Null directions that are no gauge are looked for by
     inverse iteration with the factor, and deflated in the same way.
     """
+    size = matrix.shape[0]
+    nothing = np.zeros((size, 0))
+    if not size:
+        return JointInverse(np.zeros((0, 0)), nothing, nothing, np.zeros((0, 0)), np.zeros(0, dtype=bool), 0)
     diagonal = matrix.diagonal()
     dead = diagonal <= _DEAD * before
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
@@ -117,8 +121,6 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     inverse, _ = lapack.dpotri(factor.array, lower=1, overwrite_c=1)
     _finish(inverse, deflated, scale, dead)
     lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
-    size = len(scale)
-    nothing = np.zeros((size, 0))
     return JointInverse(inverse.T, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
 
 
@@ -137,9 +139,8 @@ class _Factor:
 
 def _dense(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> FloatArray:
     """S with unit diagonal plus Z Z^T; 1 on the diagonal of dead columns. In Fortran order, for LAPACK."""
-    by = 1.0 / scale
-    scaled = matrix.copy()
-    scaled.data *= by[scaled.indices] * np.repeat(by, np.diff(scaled.indptr))
+    data = matrix.data / scale[matrix.indices] / np.repeat(scale, np.diff(matrix.indptr))
+    scaled = sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
     out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
     if dead.any():
         out[dead] = 0.0

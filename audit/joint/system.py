@@ -164,7 +164,7 @@ def joint_system(
     Parameters
     ----------
     sigma_px : (I,) sigma_constant_px, NaN where unknown
-    frame_idx, image_from_frame : (I,) and (I, 6, 6) where rigs are claimed, see `audit.joint.layout.Layout`
+    frame_idx, image_from_frame : (I,) and (I, 6, 6) where rigs are claimed, see `sfm_audit.audit.joint.layout.Layout`
     left_out : (I,) images whose observations take no part (cameras and points that do not belong together, section 12)
     points_independent : the 3D points were not triangulated from these images: S = B
     """

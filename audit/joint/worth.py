@@ -32,7 +32,7 @@ def worth_of(system: JointSystem, image_idx: int, scores: CandidateScores, own: 
 
     Parameters
     ----------
-    root : L of `audit.joint.group_test.group_root`
+    root : L of `sfm_audit.audit.joint.group_test.group_root`
 
     Notes
     -----

@@ -10,7 +10,7 @@ from joint_reference import SPEC, model_of, with_param
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.joint import audit_jointly, covisible_blocks
+from sfm_audit.audit.joint import CameraStep, audit_jointly, covisible_blocks
 from sfm_audit.audit.joint.own import _implied_focal
 from sfm_audit.audit.table.words import MisfitStatus
 
@@ -91,3 +91,43 @@ def test_implied_focal_undoes_the_linearisation(true, depth):
 
 def test_implied_focal_without_an_answer_is_the_linear_one():
     assert _implied_focal(1000.0, 900.0, 1.9) == 1900.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "material"),
+    [
+        ({}, True),
+        ({"own_step_px": 0.19}, False),
+        ({"plain_step_px": 0.19}, False),
+        ({"plain_step": np.array([-60.0, 0.0])}, False),
+        ({"plain_step": np.array([4.9, 0.0])}, False),
+        ({"step": np.array([4.9, 0.0])}, False),
+        ({"sd": np.array([np.nan, 1.0])}, False),
+    ],
+)
+def test_a_step_is_material_if_both_say_so(changes, material):
+    step = CameraStep(
+        camera_idx=0,
+        image_idxs=np.arange(3),
+        num_observations=100,
+        names=("f", "k"),
+        stored=np.array([1000.0, 0.0]),
+        step=np.array([50.0, 0.0]),
+        sd=np.array([1.0, 1.0]),
+        plain_step=np.array([60.0, 0.0]),
+        own_step_px=0.21,
+        plain_step_px=0.21,
+        sd_focal_rel=0.001,
+        focal_identified=True,
+        implied=np.array([1050.0, 0.0]),
+    )
+    assert dataclasses.replace(step, **changes).is_material(0.2) is material
+
+
+def test_a_model_without_usable_images_says_nothing(chain):
+    found = audited(chain, left_out=np.ones(30, dtype=bool))
+    assert found.steps == ()
+    assert found.implied == []
+    assert np.isnan(found.misfit.effect_px).all()
+    assert not found.misfit.most_are_wrong
+    assert all(np.isnan(gains.both) for gains in found.gains)
