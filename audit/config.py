@@ -27,7 +27,7 @@ class AuditConfig(BaseModel):
     points: PointsName = Field(
         default="in-sample",
         description="whether the 3D points were triangulated from these images (in-sample) or measured otherwise "
-        "(independent: nothing to undo, nobody to blame; takes noise = constant)",
+        "(independent: nothing to undo; takes noise = constant)",
     )
     policy: PolicyName = Field(
         default="standard",

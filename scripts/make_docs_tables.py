@@ -66,40 +66,51 @@ VERDICTS_PAGE = """# Verdicts
 
 Made from `audit/table/words.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
 
-Four verdicts judge an image, each by its own question. Each is `accepted`, `rejected`, or `undetermined` where the
-image does not say enough: undetermined is no pass.
+Each question about an image has a verdict of its own: `accepted`, `rejected`, or `undetermined` where the image does not
+say enough. Undetermined is no pass. null: the question was not asked.
 
 | column | question | rejected | undetermined |
 |---|---|---|---|
-| `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} \
-(with `min_ks_distance`: and D above it) | fewer than {min_observations} standardised observations; no noise fitted |
-| `verdict_misfit` | Does the camera model hold? | after peeling, a group has q < {alpha} *and* an effect above \
-{min_effect} | fewer than {min_observations} observations of sound points; none of radial, tangential, affine, \
-principal_point could run |
+| `verdict_misfit` | Does the camera model hold? | in the joint test, a group has q < {alpha} *and* an effect above \
+{min_effect} | none of radial, tangential, affine, principal_point could run; pose or camera wrong otherwise |
+| `verdict_camera` | Do its own parameters sit at their optimum, do the parts belong together? | freeing them would gain \
+more than {min_effect} and one moves by more than 5 sd; camera, pose, points and 2D points do not fit | the image takes \
+no part in the joint system |
 | `verdict_pose` | Is the pose at the optimum of the image's own residuals? | `pose_offset_px` > \
 {pose_offset_threshold_px} px | fewer than {min_observations} inliers |
 | `plausible` | Could this be a camera, and do the points say so? | focal length / longer side outside \
 [{min_focal_over_size}, {max_focal_over_size}]; the distortion folds inside the image; the principal point lies \
-outside | sd of f / f > {max_sd_focal_rel}; coverage < {min_coverage}; fewer than {min_occupied_cells} occupied cells; \
-fewer than {min_observations} inliers |
+outside | joint sd of f / f > {max_sd_focal_rel}; coverage < {min_coverage}; fewer than {min_occupied_cells} occupied \
+cells; fewer than {min_observations} inliers |
+| `verdict_noise` | Is the noise visibly another one than the noise model says? | `ks_stat` - 1.36 / sqrt(N) > \
+{max_noise_distance} | fewer than {min_observations} standardised observations; no noise fitted |
+| `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} \
+(with `min_ks_distance`: and D above it) | fewer than {min_observations} standardised observations; no noise fitted |
+| `verdict_outside` | Do witnesses outside of the image agree? | a witness disagrees | null where none was asked |
 
 The numbers are defaults (docs/config.md). q: Holm over the groups of an image, then Benjamini-Hochberg over the images
-of its model; nothing depends on other models. *Peeling*: shared points carry the field of a wrong image into its sound
-neighbours, so the images with the largest effects are set aside, the points triangulated from the others, and everybody
-is tested against these. Where more than half of the testable images are wrong, nobody is set aside; the verdicts then
-rest on the model as it stands, and a camera whose images together say so is named (`shared_camera`).
+of its model; nothing depends on other models. *Joint test*: shared points carry the field of a wrong image into its
+sound neighbours, so every field is tested against everything that poses, cameras and points could take up, and the
+fields of images that fail become free parameters before the others are tested again (docs/method.md, 11). Where more
+than half of the tested images are wrong, a camera whose images together say so is named (`shared_camera`).
 
 ## Policies
 
-`verdict` is what the policy of the run (`--policy`) makes of the four:
+`verdict` is what the policy of the run (`--policy`) makes of them:
 
 | policy | decides |
 |---|---|
-| `full` (default) | all four |
-| `camera` | `verdict_misfit`, `verdict_pose`, `plausible`: the noise may have any distribution |
+| `standard` (default) | all but `verdict_ks`: with thousands of observations KS rejects real noise that is hardly different |
+| `camera` | `verdict_misfit`, `verdict_camera`, `verdict_pose`, `plausible`: the noise may have any distribution |
+| `full` | all |
 | `paper` | `verdict_ks` alone |
 
-Rejected if any of them rejects; else undetermined if any of them is; else accepted.
+Rejected if any of them rejects; else undetermined if any of them is; else accepted. Questions that were not asked are
+skipped.
+
+`severity` says how bad a rejection is: **hard** where parts do not fit, the pose is off, the camera is implausible or
+away from its optimum, or a misfit is worth more than 0.2 degrees or 1 % of the focal length; **weak** where only the noise
+rejects, or a misfit is worth less than 0.02 degrees and 0.1 %; **medium** between.
 
 ## Reasons
 
@@ -110,8 +121,8 @@ the same list and decide nothing: an accepted image may carry them.
 
 ## What a verdict does not prove
 
-- KS judges the noise, misfit the camera. KS rejects a correct camera whose noise is not what the model of the noise
-  says, and with few observations it accepts a wrong lens.
+- KS and `verdict_noise` judge the noise, misfit the camera. KS rejects a correct camera whose noise is not what the model
+  of the noise says, and with few observations it accepts a wrong lens.
 - An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration (a repeated facade
   matched to the wrong copy), global scale, or drift.
 - A pose that was adjusted together with its error is at its optimum: `verdict_pose` finds poses that were changed, or
@@ -120,7 +131,10 @@ the same list and decide nothing: an accepted image may carry them.
   same (`misfit_px`, `misfit_q`).
 - A group that the camera model has already, as radial in FULL_OPENCV, is null: it could not be tested, which is no
   pass. Spherical cameras have no misfit test.
-- Standard deviations of camera parameters are conditional on the points, so they are lower bounds.
+- Standard deviations of camera parameters are small still: real errors are two to five times as large
+  (docs/realtruth.md). Those in columns that end in `_conditional` take the points as exact.
+- What points and poses absorbed leaves no residual: a principal point 8 px off shows only as a finding
+  (`implied_principal_point`).
 - Accepted is no p-value: of correct images some are rejected too (docs/validation.md says how many).
 """
 

@@ -36,7 +36,7 @@ def misfit_groups(row: Mapping[str, Any], *, tau_px: float | None = None, alpha:
 
     Notes
     -----
-    On the model as it stands, before images at fault are peeled off.
+    On the model as it stands, the image by itself.
     """
     figure, axes = new_axes(height_in=1.9)
     size = [row[f"misfit_{group}_px"] for group in MISFIT_GROUPS]

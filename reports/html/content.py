@@ -13,7 +13,15 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from sfm_audit.audit.table import TABLES
-from sfm_audit.audit.table.words import POLICIES, VERDICT_ORDER, Member, Verdict, is_remark, verdict_under
+from sfm_audit.audit.table.words import (
+    POLICIES,
+    SEVERITY_ORDER,
+    VERDICT_ORDER,
+    Member,
+    Verdict,
+    is_remark,
+    verdict_under,
+)
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.reasons import reasons_of
@@ -95,10 +103,11 @@ def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
 
 
 def severity(row: Row) -> tuple[Any, ...]:
-    """Return a sort key: rejected first, then the largest misfit, then the largest KS distance, then by name."""
+    """Return a sort key: rejected first, then by severity, the largest misfit, the largest KS distance, and by name."""
     misfit, distance = (row[name] if row[name] is not None else 0.0 for name in ("misfit_px", "ks_stat"))
     where = natural_key(row["scene"], row["component"], row["image_name"])
-    return (VERDICT_ORDER.get(row["verdict"], 1), -misfit, -distance, *where)
+    severity = SEVERITY_ORDER.get(row["severity"], len(SEVERITY_ORDER))
+    return (VERDICT_ORDER.get(row["verdict"], 1), severity, -misfit, -distance, *where)
 
 
 def _count(content: RunContent, row: Row) -> None:

@@ -186,7 +186,7 @@ def _distributions(content: RunContent) -> list[Picture]:
         "Excess kurtosis: 0 for a normal, positive for heavy tails.": figures.noise_comparison(
             numbers["kurtosis_constant"], numbers["kurtosis_excess"], names=both, label="excess kurtosis of z"
         ),
-        "Systematic residual of the named misfit, after peeling.": figures.histogram_by_verdict(
+        "Systematic residual of the named misfit that nothing else could take up.": figures.histogram_by_verdict(
             numbers["misfit_px"], verdicts, label="misfit, px RMS", log=True, marks=marks
         ),
         "Observed over predicted variance: below 1 over-fitted, above 1 under-fitted.": figures.histogram_by_verdict(

@@ -34,7 +34,10 @@ LIMITS: Final = (
         "A pose that was adjusted together with its error is at its optimum, and a misfit below the effect that "
         "matters (--min-effect) is left alone."
     ),
-    "Standard deviations and expected errors take the 3D points as exact: they are lower bounds.",
+    (
+        "Standard deviations and expected errors of the joint system are still small: on photos with known cameras real "
+        "errors are about 5 times the standard deviation (docs/realtruth.md)."
+    ),
     "Undetermined is no pass: the image does not say enough about itself.",
 )
 """What a verdict does not prove."""
@@ -66,6 +69,13 @@ _WORDS: Final = {
     "few_occupied_cells": "its points lie in too few parts of the image ({detail} cells)",
     "fronto_parallel": "its points lie in a plane that is nearly parallel to the image ({detail})",
     "degenerate_input": "its points determine no camera ({detail})",
+    "inconsistent": "camera, pose, points and 2D points do not belong together: {detail}",
+    "points_behind": "nothing of it lies before the camera: {detail}",
+    "camera_not_optimal": "a parameter of its camera is not where adjusting everything would put it: {detail}",
+    "camera_not_tested": "its camera could not be asked in the joint system ({detail})",
+    "misfit_without_worth": "a misfit that would change pose and focal length by next to nothing: {detail}",
+    "noise_differs": "the noise is visibly another one than the noise model says ({detail}){tails}",
+    "pixel_convention": "half a pixel between 2D points and cameras explains it: {detail}",
 }
 REASON_CODES: Final = frozenset(_WORDS)
 
@@ -284,7 +294,8 @@ def _parameter_facts(row: Mapping[str, Any], config: Mapping[str, Any]) -> list[
             px(row["pose_offset_px"]),
         ),
         ("focal length / longer side", number(row["focal_over_size"])),
-        ("sd of the focal length (given the points)", "-" if relative is None else f"{relative:.2%}"),
+        ("sd of the focal length", "-" if relative is None else f"{relative:.2%}"),
+        ("what freeing the camera's own parameters would gain, px", px(row.get("own_step_px"))),
         ("expected error of one measurement, px", px(row["expected_error_px"])),
     ]
 
@@ -295,18 +306,28 @@ def _series(row: Mapping[str, Any], show: Any, *names: str) -> str:
 
 def _misfit_lines(row: Mapping[str, Any], config: Mapping[str, Any], where: str | None) -> str:
     tau = config.get("min_effect")
-    lines = [f"Misfit: what of the residuals is systematic (matters above {tau})"]
+    lines = [f"Misfit: what of the residuals is systematic, and nothing else could take up (matters above {tau})"]
     for group in MisfitGroup:
-        size, p, rank = row[f"misfit_{group}_px"], row[f"misfit_{group}_p"], row[f"misfit_{group}_rank"]
-        if size is not None:
-            said = f"{px(size)} px RMS, p = {probability(p)}"
+        joint, stands = row.get(f"misfit_{group}_px_joint"), row[f"misfit_{group}_px"]
+        if joint is not None:
+            said = f"{px(joint)} px RMS, q = {probability(row[f'misfit_{group}_q_joint'])}"
         else:
-            said = "the camera model has it already" if rank == 0 else "not tested"
-        lines.append(f"  {group.replace('_', ' '):<20}{said}")
+            said = "the camera model has it already" if row[f"misfit_{group}_rank"] == 0 else "not tested"
+        alone = f"   (the image alone: {px(stands)} px)" if stands is not None else ""
+        lines.append(f"  {group.replace('_', ' '):<20}{said}{alone}")
     if row["misfit_group"]:
-        cause = f"  named cause: {row['misfit_group'].replace('_', ' ')}, {px(row['misfit_px'])} px RMS after peeling"
-        lines.append(cause + (f", {where}" if where else ""))
+        cause = f"  named cause: {row['misfit_group'].replace('_', ' ')}, {px(row['misfit_px'])} px RMS"
+        lines.append(cause + (f", {where}" if where else "") + _worth_words(row))
     return "\n".join(lines)
+
+
+def _worth_words(row: Mapping[str, Any]) -> str:
+    """Say what admitting the misfit would change."""
+    turn, focal = row.get("misfit_worth_deg"), row.get("misfit_worth_focal_rel")
+    if turn is None:
+        return ""
+    said = f"{turn:.2g} degrees"
+    return f"; worth {said}" if focal is None else f"; worth {said} and {abs(focal):.2g} of the focal length"
 
 
 def _picture_lines(pictures: Mapping[str, str], width: int) -> str:

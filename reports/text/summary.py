@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, VERDICT_ORDER, Member, Verdict
+from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, SEVERITY_ORDER, VERDICT_ORDER, Member, Verdict
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
 from sfm_audit.reports.text.reasons import reasons_part
@@ -41,7 +41,7 @@ MODEL_COLUMNS: Final = (
 IMAGE_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "image_name", "num_inliers", "rms_px", "sigma_predicted_px"),
     *("sigma_constant_px", "noise_model", "ks_stat", "ks_p", "misfit_group", "misfit_px", "pose_offset_px"),
-    *("coverage", "verdict", *map(str, Member)),
+    *("coverage", "verdict", "severity", *map(str, Member)),
 )
 CAMERA_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "camera_id", "camera_model", "num_images"),
@@ -234,7 +234,7 @@ def _images_part(run: RunReader, models: _Models, page: Page) -> list[str]:
             optional=True,
         ),
     ]
-    listing = Listing(f"{title} (rejected first, then by misfit, then by KS distance)", "image", names, rows)
+    listing = Listing(f"{title} (rejected first, then by severity, misfit, KS distance)", "image", names, rows)
     text = draw(listing, fields, page)
     if len(rows) < total:
         text += f"... and {total - len(rows)} more, see {plain(str(run.folder))}/images\n"
@@ -317,7 +317,8 @@ def _model_order(row: Row) -> Any:
 def _image_order(row: Row) -> Any:
     misfit, distance = (row[name] if row[name] is not None else 0.0 for name in ("misfit_px", "ks_stat"))
     where = (_model_order(row), natural_key(row["image_name"]))
-    return (VERDICT_ORDER.get(row["verdict"], 1), -misfit, -distance, *where)
+    severity = SEVERITY_ORDER.get(row["severity"], len(SEVERITY_ORDER))
+    return (VERDICT_ORDER.get(row["verdict"], 1), severity, -misfit, -distance, *where)
 
 
 def _model_name(row: Row, *, several: bool) -> str:
