@@ -66,16 +66,16 @@ VERDICTS_PAGE = """# Verdicts
 
 Made from `audit/table/words.py` and `audit/config.py` by `scripts/make_docs_tables.py`; do not edit.
 
-Each question about an image has a verdict of its own: `accepted`, `rejected`, or `undetermined` where the image does not
-say enough. Undetermined is no pass. null: the question was not asked.
+Each question about an image has a verdict of its own: `accepted`, `rejected`, or `undetermined` where the image does
+not say enough. Undetermined is no pass. null: the question was not asked.
 
 | column | question | rejected | undetermined |
 |---|---|---|---|
 | `verdict_misfit` | Does the camera model hold? | in the joint test, a group has q < {alpha} *and* an effect above \
 {min_effect} | none of radial, tangential, affine, principal_point could run; pose or camera wrong otherwise |
-| `verdict_camera` | Do its own parameters sit at their optimum, do the parts belong together? | freeing them would gain \
-more than {min_effect} and one moves by more than 5 sd; camera, pose, points and 2D points do not fit | the image takes \
-no part in the joint system |
+| `verdict_camera` | Do its own parameters sit at their optimum, do the parts belong together? | freeing them would \
+gain more than {min_effect} and one moves by more than 5 sd; camera, pose, points and 2D points do not fit | the image \
+takes no part in the joint system |
 | `verdict_pose` | Is the pose at the optimum of the image's own residuals? | `pose_offset_px` > \
 {pose_offset_threshold_px} px | fewer than {min_observations} inliers |
 | `plausible` | Could this be a camera, and do the points say so? | focal length / longer side outside \
@@ -100,7 +100,7 @@ than half of the tested images are wrong, a camera whose images together say so 
 
 | policy | decides |
 |---|---|
-| `standard` (default) | all but `verdict_ks`: with thousands of observations KS rejects real noise that is hardly different |
+| `standard` (default) | all but `verdict_ks`, which with thousands of observations rejects noise that is hardly odd |
 | `camera` | `verdict_misfit`, `verdict_camera`, `verdict_pose`, `plausible`: the noise may have any distribution |
 | `full` | all |
 | `paper` | `verdict_ks` alone |
@@ -109,8 +109,8 @@ Rejected if any of them rejects; else undetermined if any of them is; else accep
 skipped.
 
 `severity` says how bad a rejection is: **hard** where parts do not fit, the pose is off, the camera is implausible or
-away from its optimum, or a misfit is worth more than 0.2 degrees or 1 % of the focal length; **weak** where only the noise
-rejects, or a misfit is worth less than 0.02 degrees and 0.1 %; **medium** between.
+away from its optimum, or a misfit is worth more than 0.2 degrees or 1 % of the focal length; **weak** where only the
+noise rejects, or a misfit is worth less than 0.02 degrees and 0.1 %; **medium** between.
 
 ## Reasons
 
@@ -121,8 +121,8 @@ the same list and decide nothing: an accepted image may carry them.
 
 ## What a verdict does not prove
 
-- KS and `verdict_noise` judge the noise, misfit the camera. KS rejects a correct camera whose noise is not what the model
-  of the noise says, and with few observations it accepts a wrong lens.
+- KS and `verdict_noise` judge the noise, misfit the camera. KS rejects a correct camera whose noise is not what the
+  model of the noise says, and with few observations it accepts a wrong lens.
 - An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration (a repeated facade
   matched to the wrong copy), global scale, or drift.
 - A pose that was adjusted together with its error is at its optimum: `verdict_pose` finds poses that were changed, or
