@@ -19,7 +19,7 @@ from sfm_audit.audit.simulate.adjust import write_adjusted_model
 from sfm_audit.audit.simulate.defects import DefectKind
 from sfm_audit.audit.simulate.demo import TruthRecord, demo_scene, truth_records
 from sfm_audit.audit.simulate.scene import simulate_scene
-from sfm_audit.audit.table.words import Member, ReasonCode, Verdict, is_remark, verdict_under
+from sfm_audit.audit.table.words import POLICIES, Member, ReasonCode, Verdict, is_remark, verdict_under
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, draw
 from sfm_audit.reports.text.wording import MISSING, counted, paragraph
@@ -137,16 +137,13 @@ def _why_not_found(row: Row, min_effect: str) -> str:
 
 def _false_alarms(sound: Sequence[Row]) -> list[str]:
     """Count the sound images that are rejected, by policy."""
-    rejected = {
-        policy: sum(verdict_under(policy, row) == Verdict.REJECTED for row in sound)
-        for policy in ("full", "camera", "paper")
-    }
-    counts = f"{rejected['full']} under policy full, {rejected['camera']} camera, {rejected['paper']} paper"
-    lines = [f"Of {counted(len(sound), 'sound image')} rejected (false alarms): {counts}."]
+    rejected = {policy: sum(verdict_under(policy, row) == Verdict.REJECTED for row in sound) for policy in POLICIES}
+    counts = ", ".join(f"{num} {policy}" for policy, num in rejected.items())
+    lines = [f"Of {counted(len(sound), 'sound image')} rejected (false alarms), by policy: {counts}."]
     if rejected["paper"]:
         lines.append(
             "KS judges the noise: here it differs from track to track, and where the noise model did not quite predict "
-            "it, KS rejects an image whose camera is right. Policy camera leaves KS out."
+            "it, KS rejects an image whose camera is right. Policy standard asks for a difference that can be seen."
         )
     return lines
 

@@ -1,6 +1,6 @@
 """How are the images of one large model spread over processes? They all read one copy of what the images share.
 
-What a model's images share (residuals, tracks, the prior, the joint system) is computed once, by the process that audits the
+What a model's images share (residuals, tracks, the joint system) is computed once, by the process that audits the
 model, pickled into a file without a name, and mapped into the memory of the others: the numbers they work on are the
 same bytes in the same layout, so the tables are the same to the last bit.
 """

@@ -35,8 +35,8 @@ LIMITS: Final = (
         "matters (--min-effect) is left alone."
     ),
     (
-        "Standard deviations and expected errors of the joint system are still small: on photos with known cameras real "
-        "errors are about 5 times the standard deviation (docs/realtruth.md)."
+        "Standard deviations and expected errors are small still: on photos with known cameras real errors are up to "
+        "5 times the standard deviation (docs/realtruth.md)."
     ),
     "Undetermined is no pass: the image does not say enough about itself.",
 )
