@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pycolmap
 
 from sfm_audit.audit.table import build_table, schema
+from sfm_audit.audit.table.words import Member
 from sfm_audit.loaders import ModelRef
 from sfm_audit.loaders.datasets.input_state import InputState
 from sfm_audit.reports.run_folder.store import RunSettings
@@ -51,6 +52,8 @@ def sample_table(name: str, num_rows: int, **given: Any) -> pa.Table:
         pa.types.is_integer: np.full(num_rows, 3),
     }
     wanted = schema(name)
+    if name == "images":
+        given = {**dict.fromkeys(map(str, Member), ["accepted"] * num_rows), "severity": [None] * num_rows, **given}
     columns = {field.name: next(fill for is_type, fill in fills.items() if is_type(field.type)) for field in wanted}
     return build_table({**columns, **given}, wanted)
 

@@ -337,9 +337,10 @@ def is_remark(code: str, row: Mapping[str, Any]) -> bool:
 def strongest(verdicts: Iterable[str | None]) -> Verdict:
     """Return rejected if any verdict rejects, else undetermined if any is, else accepted; None was not asked.
 
-    Undetermined where nothing was asked.
+    Undetermined where nothing was asked, and where a table holds another word.
     """
-    said = [Verdict(verdict) for verdict in verdicts if verdict is not None]
+    words = set(Verdict)
+    said = [Verdict(each) if each in words else Verdict.UNDETERMINED for each in verdicts if each is not None]
     return min(said, key=VERDICT_ORDER.__getitem__, default=Verdict.UNDETERMINED)
 
 

@@ -137,7 +137,7 @@ def _questions(content: RunContent) -> list[dict[str, Any]]:
     return [
         {"name": name, "words": words, "decides": name == f"policy {policy}", **_shares(content.counts[name])}
         for name, words in rows
-        if content.counts[name]
+        if content.counts[name] or not content.num_images
     ]
 
 
@@ -149,7 +149,7 @@ def _shares(counts: Mapping[str, int]) -> dict[str, Any]:
 
 def _verdict_figure(content: RunContent) -> Markup:
     names = (*(f"policy {name}" for name in POLICIES), *map(str, Member))
-    counts = {name: content.counts[name] for name in names if content.counts[name]}
+    counts = {name: content.counts[name] for name in names if content.counts[name] or not content.num_images}
     return to_svg(figures.verdict_bars(counts), key="verdicts", label="Verdicts by policy and question; see the table")
 
 

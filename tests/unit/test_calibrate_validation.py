@@ -124,7 +124,7 @@ def test_plane_geometry_of_known_planes():
 def test_a_fronto_parallel_board_determines_no_focal_length():
     found = validate(*estimated("D3", tilt_deg=(0.3, -0.2), extent=0.7))
     assert found.verdict == UNDETERMINED
-    assert {ReasonCode.FOCAL_NOT_IDENTIFIED, ReasonCode.FRONTO_PARALLEL} <= set(codes(found.judgement))
+    assert {ReasonCode.FOCAL_NOT_IDENTIFIED, ReasonCode.FRONTO_PARALLEL} <= set(codes(found.decision.judgement))
     assert abs(correlation_focal_depth(found.estimate)) > 0.9999
     assert found.identifiability.sd_focal_rel > 0.01
 
@@ -141,12 +141,12 @@ def test_too_few_and_too_exact():
     few = np.arange(correspondences.num) % 12 == 0
     found = validate(fitted("D1", D1, correspondences, rotation, translation, inliers=few), correspondences)
     assert found.verdict == UNDETERMINED
-    assert codes(found.judgement) == [ReasonCode.TOO_FEW_OBSERVATIONS]
+    assert codes(found.decision.judgement) == [ReasonCode.TOO_FEW_OBSERVATIONS]
     exact, rotation, translation = board(np.random.default_rng(0), noise_px=0.0)
     estimate = estimate_of("D3", true_camera(), rotation, translation, exact, inliers=np.ones(exact.num, dtype=bool))
     found = validate(estimate, exact)
     assert found.decision.of(Member.KS) == found.decision.of(Member.MISFIT) == UNDETERMINED
-    assert ReasonCode.EXACT_PROJECTIONS in codes(found.judgement)
+    assert ReasonCode.EXACT_PROJECTIONS in codes(found.decision.judgement)
 
 
 def test_outliers_stay_out():

@@ -150,7 +150,7 @@ def test_one_image_alone_equals_constant_noise_in_its_model(model):
 
 
 def test_alpha_moves_the_verdict_and_the_reason_carries_the_numbers(model):
-    row = audit_model(model, AuditConfig(alpha=0.999)).images.to_pylist()[0]
+    row = audit_model(model, AuditConfig(alpha=0.999, policy="paper")).images.to_pylist()[0]
     assert row["verdict"] == "rejected"
     assert row["reasons"][0].startswith("ks_rejected: p = ")
     assert f"D = {row['ks_stat']:.4f}" in row["reasons"][0]

@@ -127,7 +127,9 @@ def test_counts_are_the_tables(nasty):
         (("accepted", "accepted"), "accepted"),
         (("undetermined", "accepted"), "undetermined"),
         (("undetermined", "rejected"), "rejected"),
-        ((None, "accepted"), "undetermined"),
+        ((None, "accepted"), "accepted"),  # not asked
+        ((None, None), "undetermined"),
+        (("nonsense", "accepted"), "undetermined"),
     ],
 )
 def test_a_policy_is_as_strict_as_its_strictest_member(verdicts, expected):

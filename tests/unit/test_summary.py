@@ -156,10 +156,12 @@ def test_remarks_are_not_told_as_reasons(run_folder):
 
 @pytest.mark.parametrize("code", ReasonCode)
 @pytest.mark.parametrize("verdict", Verdict)
-def test_three_codes_can_be_remarks(code, verdict):
-    wanted = code in {ReasonCode.K1_NOT_IDENTIFIED, ReasonCode.FRONTO_PARALLEL} or (
-        code == ReasonCode.MISFIT_NOT_TESTED and verdict != Verdict.UNDETERMINED
-    )
+def test_which_codes_can_be_remarks(code, verdict):
+    always = {
+        *(ReasonCode.K1_NOT_IDENTIFIED, ReasonCode.FRONTO_PARALLEL),
+        *(ReasonCode.MISFIT_WITHOUT_WORTH, ReasonCode.PIXEL_CONVENTION),
+    }
+    wanted = code in always or (code == ReasonCode.MISFIT_NOT_TESTED and verdict != Verdict.UNDETERMINED)
     assert is_remark(str(code), {"verdict_misfit": str(verdict)}) == wanted
 
 

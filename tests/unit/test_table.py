@@ -57,9 +57,14 @@ def test_columns_are_design_s_in_design_s_order(name, contract):
 
 @pytest.mark.parametrize("column", [*IMAGES, *CAMERAS, *MODELS], ids=lambda column: column.name)
 def test_types_are_design_s(column):
+    counts = {"occupied_cells", "joint_blocks"}
     if column.name in {"image_id", "camera_id", "width", "height"}:
         wanted = pa.uint32()
-    elif column.name.startswith("num_") or column.name.endswith("_rank") or column.name == "occupied_cells":
+    elif (
+        column.name.startswith("num_")
+        or column.name.endswith(("_rank", "_rank_joint"))
+        or column.name in {"occupied_cells", "joint_blocks"}
+    ):
         wanted = pa.int64()
     elif column.name in {"noise_converged", "folds_over", "misfit_material"}:
         wanted = pa.bool_()
