@@ -57,7 +57,6 @@ def test_columns_are_design_s_in_design_s_order(name, contract):
 
 @pytest.mark.parametrize("column", [*IMAGES, *CAMERAS, *MODELS], ids=lambda column: column.name)
 def test_types_are_design_s(column):
-    counts = {"occupied_cells", "joint_blocks"}
     if column.name in {"image_id", "camera_id", "width", "height"}:
         wanted = pa.uint32()
     elif (
