@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.diagnostics import CameraDiagnostics, Diagnostics
-from sfm_audit.audit.decision.misfit import MisfitDecision
+from sfm_audit.audit.decision.diagnostics import CameraDiagnostics, Diagnostics, Worth
+from sfm_audit.audit.decision.misfit import MisfitDecision, is_worth_nothing
 from sfm_audit.audit.table.thresholds import EXACT_SHARE, HALF_PIXEL_SHIFT_PX, KS_CRITICAL
 from sfm_audit.audit.table.words import MISFIT_CODES, Member, MisfitGroup, Reason, ReasonCode, Verdict
 
@@ -102,6 +102,9 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
         return undetermined(unknown)
     remarks = _not_tested(found)
     if found.group is not None and found.material:
+        worth = misfit.groups[found.group].worth
+        if worth is not None and is_worth_nothing(found.group, worth):
+            return Judgement(Verdict.ACCEPTED, (_without_worth(found, worth), *remarks))
         shared = misfit.shared
         beside = (
             ()
@@ -124,6 +127,15 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
         nothing = Reason(ReasonCode.MISFIT_NOT_TESTED, member, "no group left")
         return undetermined(*(remarks or (nothing,)))
     return Judgement(Verdict.ACCEPTED, remarks)
+
+
+def _without_worth(found: MisfitDecision, worth: Worth) -> Reason:
+    turn, focal = (
+        f"{worth.rotation_deg:.2g} degrees",
+        "" if math.isnan(worth.focal_rel) else f", {worth.focal_rel:+.2g} of f",
+    )
+    text = f"{found.group} {found.px:.2f} px, worth {turn}, {worth.centre_rel:.2g} of the depth{focal}"
+    return Reason(ReasonCode.MISFIT_WITHOUT_WORTH, Member.MISFIT, text, found.px, found.tau_px, "px", found.group)
 
 
 def _not_tested(found: MisfitDecision) -> tuple[Reason, ...]:

@@ -6,9 +6,16 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from sfm_audit.audit.decision.diagnostics import GroupDiagnostics
+from sfm_audit.audit.decision.diagnostics import GroupDiagnostics, Worth
+from sfm_audit.audit.table.thresholds import (
+    MIN_SHIFT_WORTH_CENTRE,
+    MIN_SHIFT_WORTH_FOCAL_REL,
+    WEAK_WORTH_DEG,
+    WEAK_WORTH_FOCAL_REL,
+)
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 
+_SHIFTS = frozenset({MisfitGroup.PRINCIPAL_POINT, MisfitGroup.TANGENTIAL})
 _SAYS_NOTHING = frozenset({MisfitStatus.TESTED, MisfitStatus.ABSORBED})
 
 
@@ -40,6 +47,19 @@ def decide_misfit(groups: Mapping[MisfitGroup, GroupDiagnostics], *, alpha: floa
         return MisfitDecision(None, math.nan, math.nan, tau_px, (), (), untested)
     also = tuple((group, groups[group].px) for group in material if group != cause)
     return MisfitDecision(cause, groups[cause].px, groups[cause].q, tau_px, material, also, untested)
+
+
+def is_worth_nothing(group: MisfitGroup, worth: Worth | None) -> bool:
+    """Whether admitting a misfit would change nothing that anybody uses: such an image is accepted with a remark.
+
+    Unknown worth counts as enough.
+    """
+    if worth is None or math.isnan(worth.rotation_deg):
+        return False
+    focal = 0.0 if math.isnan(worth.focal_rel) else abs(worth.focal_rel)
+    if group in _SHIFTS:
+        return worth.centre_rel < MIN_SHIFT_WORTH_CENTRE and focal < MIN_SHIFT_WORTH_FOCAL_REL
+    return worth.rotation_deg < WEAK_WORTH_DEG and focal < WEAK_WORTH_FOCAL_REL
 
 
 def named_cause(

@@ -179,7 +179,9 @@ def image_advice(quality: CameraQuality, decision: Decision, retest: Retest, *, 
     """
     misfit = decision.misfit
     rejects = any(judgement.verdict is Verdict.REJECTED for judgement in decision.members.values())
-    if misfit is None or (rejects and not misfit.material) or decision.of(Member.MISFIT) is Verdict.UNDETERMINED:
+    if misfit is None or decision.of(Member.MISFIT) is Verdict.UNDETERMINED:
+        return None
+    if bool(misfit.material) != (decision.of(Member.MISFIT) is Verdict.REJECTED) or (rejects and not misfit.material):
         return None
     return advised_camera_model(
         quality.shape.camera,
