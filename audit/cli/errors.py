@@ -13,7 +13,18 @@ class ExitCode(IntEnum):
     USAGE = 2  # wrong usage or config; the run folder is in use or holds another run
     UNREADABLE_INPUT = 3  # some input could not be read or holds no model; the rest was audited and written
     OUTPUT = 4  # the output could not be written; finished parts stay
-    INTERRUPTED = 130  # as shells have it for SIGINT
+    AUDIT_STOPPED = 5  # a bug or a limit stopped single models; all others were audited and written
+    HANGUP = 129  # as shells have it for SIGHUP, SIGINT and SIGTERM
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+
+class Ended(BaseException):
+    """A signal asked the process to end."""
+
+    def __init__(self, exit_code: ExitCode) -> None:
+        super().__init__(exit_code)
+        self.exit_code = exit_code
 
 
 class KnownError(Exception):
