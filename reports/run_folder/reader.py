@@ -49,7 +49,7 @@ class RunReader:
             record = read_run_json(folder)
         except OSError as error:
             raise RunFolderError(folder, "holds no run (run.json)", "name the folder that run -o wrote") from error
-        info = record.model_dump(exclude={"inputs", "manifest"})
+        info = record.model_dump(mode="json", exclude={"inputs", "manifest"})
         if _is_old(folder, record):
             return cls(folder, info, old_models(folder, record), OLD_NOTE)
         if record.status == "complete" and record.manifest is None:

@@ -251,7 +251,13 @@ class RunStore:
         if not all(fits(part_path(self.folder, name, key), part) for name, part in model.parts.items()):
             return None
         said = _read_part(part_path(self.folder, "models", key))
-        return None if said is None else (line, said)
+        if said is None or (said.labels, said.state.digest, said.state.num_bytes) != (
+            model.labels,
+            model.sha256,
+            model.num_bytes,
+        ):
+            return None
+        return line, said
 
     def _remove_strangers(self, kept: AbstractSet[str], reports: AbstractSet[str]) -> None:
         """Remove parts of models that are not kept, and reports of failures that are none any more."""
