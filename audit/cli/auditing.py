@@ -39,7 +39,7 @@ class RunRequest:
     jobs: number of processes, None for as many as there are CPUs and work for them.
     observations: whether to write a row per inlier too.
     dask: address of a Dask scheduler, or "local"; None without Dask.
-    wanted: which models below the PATHs.    max_model_bytes: a larger one is not loaded; None for no limit.
+    wanted: which models below the PATHs.
     limits: what the audit of one may take.    verify: whether to read unchanged inputs again.
     """
 
@@ -51,7 +51,6 @@ class RunRequest:
     observations: bool = False
     dask: str | None = None
     wanted: Wanted = field(default_factory=Wanted)
-    max_model_bytes: int | None = None
     limits: Limits = NO_LIMITS
     verify: bool = False
 
@@ -149,7 +148,6 @@ def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure]
             on_failure=lambda failure: problems.append(as_said(failure)),
             observations=request.observations,
             dask=request.dask,
-            max_model_bytes=request.max_model_bytes,
             limits=request.limits,
             verify=request.verify,
         )

@@ -37,7 +37,7 @@ def make_page(run: RunReader, photos: Path | None, worst: int, named: Sequence[s
     """
     try:
         content = html.read_content(run)
-    except (OSError, pa.ArrowException, KeyError) as error:  # KeyError: a column of another version is missing
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:  # a column or a word of another version
         what = f"its tables cannot be read ({' '.join(str(error).split())[:200]})"
         raise RunFolderError(run.folder, what, "audit again into a new folder") from error
     source = ResidualSource(run, named)

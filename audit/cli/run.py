@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any, get_args
 
@@ -104,7 +105,6 @@ def command(  # one parameter per option
         return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
     if out is None:
         raise click.UsageError("Missing option '-o': the folder for the tables.")
-    limit_gb = options["max_model_gb"]
     request = RunRequest(
         paths,
         out,
@@ -114,8 +114,7 @@ def command(  # one parameter per option
         options["observations"],
         options["dask"],
         wanted,
-        None if limit_gb is None else int(limit_gb * 1e9),
-        _limits(options["max_model_memory"], options["max_model_seconds"]),
+        _limits(options["max_model_gb"], options["max_model_memory"], options["max_model_seconds"]),
         options["verify"],
     )
     exit_code = run_audit(request)
@@ -124,7 +123,11 @@ def command(  # one parameter per option
     return exit_code
 
 
-def _limits(memory_gb: float | None, seconds: float | None) -> Limits:
+def _limits(input_gb: float | None, memory_gb: float | None, seconds: float | None) -> Limits:
     if memory_gb is not None and not Path("/proc/self/statm").exists():
         raise click.UsageError("--max-model-memory: this operating system does not say how much a process has.")
-    return Limits(None if memory_gb is None else int(memory_gb * 1e9), seconds)
+    return Limits(_bytes(input_gb), _bytes(memory_gb), seconds)
+
+
+def _bytes(gigabytes: float | None) -> int | None:
+    return None if gigabytes is None else int(min(gigabytes * 1e9, sys.maxsize))

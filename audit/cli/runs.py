@@ -50,7 +50,7 @@ def read_run(folder: Path) -> ComparedRun:
         return ComparedRun(folder, run.info, RunSnapshot.read(run))
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
-    except (pa.ArrowException, OSError, MissingColumnError) as error:
+    except (pa.ArrowException, OSError, MissingColumnError, ValueError) as error:
         problem = f"{folder}: its tables cannot be read ({error}); make the run again"
         raise KnownError(problem, ExitCode.UNREADABLE_INPUT) from error
 

@@ -112,7 +112,7 @@ def _audit_there(audit: AuditFunction, task: Task, version: str) -> Outcome:
         advice = "install the same version on all machines"
         raise ClusterError(f"a Dask worker has sfm-audit {own}, this machine {version}; {advice}")
     threadpool_limits(limits=1)
-    if not task.limits:
+    if not task.limits.need_a_process:
         return guarded(audit, task)
     multiprocessing.current_process().daemon = False  # workers are, and those may start no processes
     with Lanes[Task]() as lanes:

@@ -74,7 +74,6 @@ def audit_many(
     audit: AuditFunction = audit_one,
     observations: bool = False,
     dask: str | None = None,
-    max_model_bytes: int | None = None,
     limits: Limits = NO_LIMITS,
     verify: bool = False,
 ) -> list[Failure]:
@@ -92,33 +91,26 @@ def audit_many(
     audit : what to do with one model; must be importable by name unless it runs in this process
     observations : whether to make the tables of observations too, one row per inlier
     dask : address of a Dask scheduler whose workers audit, or "local": ``jobs`` Dask workers on this machine
-    max_model_bytes : a larger model is not loaded but becomes a Failure
-    limits : what the audit of one model may take; each is then audited in another process
-    verify : whether to read the files of all models, where otherwise equal sizes and times of change are believed
+    limits : what the audit of one model may take; beyond it, the model is a Failure
+    verify : whether to read all files, where otherwise equal sizes and times of change are believed
 
     Returns
     -------
     list of Failure
-        Models that could not be read, or whose audit a bug, a limit or the death of its process ended, in the order of
-        ``refs``. The sink drops their earlier tables.
+        In the order of ``refs``: unreadable, or a bug, a limit or the death of a process ended the audit. The sink
+        drops their earlier tables.
 
     Raises
     ------
     ClusterError
         The Dask cluster cannot be used, or was lost.
     """
-    failures: dict[str, Failure] = {}
-    tasks = []
-    for ref, digest in _unfinished(refs, sink, on_skip or on_done, verify=verify):
-        if max_model_bytes is not None and ref.num_bytes > max_model_bytes:
-            failures[ref.key] = too_large(ref, max_model_bytes)
-            sink.drop(ref.key)
-            on_failure(failures[ref.key])
-            on_done(ref)
-        else:
-            tasks.append(Task(ref, config, digest, observations, limits=limits))
+    tasks = [
+        Task(ref, config, digest, observations, limits=limits)
+        for ref, digest in _unfinished(refs, sink, on_skip or on_done, verify=verify)
+    ]
     with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
-        failures |= _hand_over(outcomes, sink, on_done, on_failure)
+        failures = _hand_over(outcomes, sink, on_done, on_failure)
     return [failures[ref.key] for ref in refs if ref.key in failures]
 
 
@@ -159,9 +151,11 @@ def _outcomes(
     tasks: Sequence[Task], jobs: int, audit: AuditFunction, dask: str | None
 ) -> Generator[tuple[Task, Outcome]]:
     """Audit in this process, in processes or on a cluster; elsewhere the largest models go first."""
+    yield from ((task, too_large(task)) for task in tasks if task.is_too_large)
+    tasks = [task for task in tasks if not task.is_too_large]
     if not tasks:
         return
-    is_limited = bool(tasks[0].limits)
+    is_limited = tasks[0].limits.need_a_process
     if dask is None and jobs <= 1 and not is_limited:
         yield from _in_this_process(tasks, audit)
         return

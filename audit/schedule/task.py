@@ -37,12 +37,18 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the audit of one model may take; None: as much as it wants.    memory_bytes: of its process as a whole."""
+    """What the audit of one model may take; None: as much as it wants.
 
+    input_bytes: a larger model is not loaded.    memory_bytes: of its process as a whole.    seconds: from its start.
+    """
+
+    input_bytes: int | None = None
     memory_bytes: int | None = None
     seconds: float | None = None
 
-    def __bool__(self) -> bool:
+    @property
+    def need_a_process(self) -> bool:
+        """Whether the audit has to be watched from another process."""
         return self.memory_bytes is not None or self.seconds is not None
 
 
@@ -65,6 +71,11 @@ class Task:
     observations: bool = False
     num_processes: int = 1
     limits: Limits = NO_LIMITS
+
+    @property
+    def is_too_large(self) -> bool:
+        """Whether the model is not even loaded."""
+        return self.limits.input_bytes is not None and self.ref.num_bytes > self.limits.input_bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,8 +114,9 @@ def audit_one(task: Task) -> Outcome:
     return Audited(state, audited.tables, time.perf_counter() - start)
 
 
-def too_large(ref: ModelRef, max_bytes: int) -> Failure:
+def too_large(task: Task) -> Failure:
     """Return the failure of a model that is not loaded because of its size."""
+    ref, max_bytes = task.ref, task.limits.input_bytes or 0
     got, limit = f"{ref.num_bytes / 1e9:.3g} GB of files", f"at most {max_bytes / 1e9:.3g} GB"
     advice = "raise --max-model-gb where there is memory for it"
     return Failure(ref.model_path, f"{ref.model_path}: expected {limit}, found {got}; {advice}", "too_large")
