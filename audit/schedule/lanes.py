@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -72,18 +72,25 @@ class _Raised:
     trace: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """Sent before a call begins."""
+
+
 @dataclass(slots=True, eq=False)
 class _Lane:
     process: multiprocessing.process.BaseProcess
     connection: Connection
     max_bytes: int | None = None
     max_seconds: float | None = None
-    started: float = 0.0
+    begun: float | None = None  # when the call did: the start of the process and its imports are not its own
 
     def excess(self) -> Exceeded | None:
         """Say what the call under way has taken too much of; None while it has not."""
-        if self.max_seconds is not None and time.monotonic() - self.started > self.max_seconds:
-            return Exceeded("time", time.monotonic() - self.started)
+        if self.max_seconds is not None and self.begun is not None:
+            seconds = time.monotonic() - self.begun
+            if seconds > self.max_seconds:
+                return Exceeded("time", seconds)
         if self.max_bytes is not None and self.process.pid is not None:
             num_bytes = resident_bytes(self.process.pid)
             if num_bytes > self.max_bytes:
@@ -156,7 +163,7 @@ class Lanes(Generic[K]):
                 _bury(lane)
                 continue
             lane.max_bytes, lane.max_seconds = limits
-            lane.started = time.monotonic()
+            lane.begun = None
             self._busy[lane.connection] = (lane, key)
             return
 
@@ -166,17 +173,25 @@ class Lanes(Generic[K]):
         An error that a call raises is raised here. A call that exceeds its limits is ended, the answer is Exceeded.
         """
         answers: list[tuple[K, Any]] = []
-        is_limited = any(lane.max_bytes or lane.max_seconds for lane, _ in self._busy.values())
-        ready = wait(list(self._busy), _LOOK_SECONDS if is_limited else None)
-        while not ready and not (answers := self._end_those_over_their_limits()):
-            ready = wait(list(self._busy), _LOOK_SECONDS)
+        while not answers:
+            is_limited = any(lane.max_bytes or lane.max_seconds for lane, _ in self._busy.values())
+            ready = wait(list(self._busy), _LOOK_SECONDS if is_limited else None)
+            answers = self._answers_of(ready) or self._end_those_over_their_limits()
+        return answers
+
+    def _answers_of(self, ready: Iterable[Any]) -> list[tuple[K, Any]]:
+        answers = []
         for connection in ready:
-            lane, key = self._busy.pop(connection)  # type: ignore[call-overload]
+            lane, key = self._busy[connection]
             try:
                 answer = lane.connection.recv()
             except (EOFError, OSError):
                 answer = _bury(lane)
-            else:
+            if isinstance(answer, _Begun):
+                lane.begun = time.monotonic()
+                continue
+            del self._busy[connection]
+            if not lane.connection.closed:
                 self._idle.append(lane)
             if isinstance(answer, _Raised):
                 raise answer.error from RemoteTracebackError(answer.trace)
@@ -222,6 +237,7 @@ def _serve(connection: Connection) -> None:
             return
         threadpool_limits(limits=1)  # for those that are loaded
         try:
+            connection.send(_Begun())
             answer = function(*arguments)
         except BaseException as error:  # noqa: BLE001 - raised again in the parent
             answer = _Raised(error, "".join(traceback.format_exception(error)))

@@ -109,6 +109,8 @@ def audit_one(task: Task) -> Outcome:
             scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
         except LoadError as error:
             return Failure(ref.model_path, str(error))
+        except MemoryError:
+            return _too_large_to_read(task)
         labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
         audited = audit_model(model, task.config, labels, scale_px, observations=task.observations, spread=spread)
     return Audited(state, audited.tables, time.perf_counter() - start)
@@ -120,6 +122,12 @@ def too_large(task: Task) -> Failure:
     got, limit = f"{ref.num_bytes / 1e9:.3g} GB of files", f"at most {max_bytes / 1e9:.3g} GB"
     advice = "raise --max-model-gb where there is memory for it"
     return Failure(ref.model_path, f"{ref.model_path}: expected {limit}, found {got}; {advice}", "too_large")
+
+
+def _too_large_to_read(task: Task) -> Failure:
+    path, size = task.ref.model_path, f"{task.ref.num_bytes / 1e9:.3g} GB of files"
+    advice = "run it where there is more, or leave such models out with --max-model-gb"
+    return Failure(path, f"{path}: memory was too short to read its {size}; {advice}", "too_large")
 
 
 def died_twice(task: Task, how: str) -> Failure:

@@ -7,6 +7,7 @@ import threadpoolctl
 from run_samples import write_models
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.schedule import task as task_module
 from sfm_audit.audit.schedule.runner import Failure, Limits, audit_many, audit_one
 from sfm_audit.loaders import discover
 from sfm_audit.loaders.datasets.input_state import InputState, input_stamp, read_input_state
@@ -115,6 +116,20 @@ def test_an_error_nobody_expects_costs_its_model_alone(refs, jobs, audit, kind, 
     for words in ("Traceback", f"in {audit.__name__}", "sfm-audit 0.", "pycolmap ", refs[1].model_path, '"alpha":0.05'):
         assert words in report
     assert report.count("\n") < 200
+
+
+def test_a_model_that_memory_is_too_short_to_read_is_an_input_that_cannot_be_read(refs, monkeypatch):
+    read = task_module.open_model
+
+    def open_model(location: str):
+        if "broken" in location:
+            raise MemoryError
+        return read(location)
+
+    monkeypatch.setattr(task_module, "open_model", open_model)
+    (failure,) = run(refs, Memory())
+    assert (failure.location, failure.kind, failure.report) == (refs[1].model_path, "too_large", None)
+    assert "memory was too short to read its " in failure.message
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
