@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.finding import Wanted, find_models
 from sfm_audit.audit.cli.progress import Progress
 from sfm_audit.audit.config import AuditConfig
@@ -27,7 +27,6 @@ from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.store import RunFailure, RunSettings, RunStore
 from sfm_audit.reports.text.drawing import Page
 from sfm_audit.reports.text.summary import render_summary
-from sfm_audit.reports.text.wording import plain
 
 _INPUT_KINDS: Final = frozenset({"unreadable", "too_large"})
 
@@ -83,7 +82,7 @@ def _say(problems: Sequence[RunFailure], folder: Path) -> ExitCode:
     codes = [ExitCode.OK]
     for problem in problems:
         where = f" ({folder / problem.report})" if problem.report else ""
-        print(f"sfm-audit: {plain(problem.message + where)}", file=sys.stderr)
+        complain(problem.message + where)
         codes.append(ExitCode.UNREADABLE_INPUT if problem.kind in _INPUT_KINDS else ExitCode.AUDIT_STOPPED)
     return max(codes)
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from enum import IntEnum
+from typing import Final
+
+_MAX_CHARACTERS: Final = 900  # of one line
 
 
 class ExitCode(IntEnum):
@@ -37,3 +42,13 @@ class KnownError(Exception):
 
     def __str__(self) -> str:
         return " ".join(self.message.split())
+
+
+def complain(message: str) -> None:
+    """Say something on stderr in one line that is safe to print: names and locations come from others' data."""
+    line = " ".join(message.split())
+    if len(line) > _MAX_CHARACTERS:
+        line = f"{line[: _MAX_CHARACTERS * 2 // 3]} ... {line[-_MAX_CHARACTERS // 3 :]}"
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in line)
+    with contextlib.suppress(OSError):  # the terminal may be gone, as after SIGHUP
+        print(f"sfm-audit: {line}", file=sys.stderr, flush=True)

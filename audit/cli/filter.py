@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Final
 import click
 import numpy as np
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.runs import open_run
 from sfm_audit.loaders import LoadError, open_model
 from sfm_audit.loaders.scene_info.file import read_scene_info
@@ -144,7 +143,7 @@ def _run(steps: Sequence[Callable[[], str]]) -> ExitCode:
             message, code = str(error), ExitCode.USAGE
         except OutputError as error:
             message, code = str(error), ExitCode.OUTPUT
-        print(f"sfm-audit: {plain(message)}", file=sys.stderr)
+        complain(message)
         codes.append(code)
     return max(codes)
 

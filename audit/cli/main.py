@@ -6,13 +6,12 @@ import importlib
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from typing import Final, cast
 
 import click
 
-from sfm_audit.audit.cli.errors import Ended, ExitCode, KnownError
+from sfm_audit.audit.cli.errors import Ended, ExitCode, KnownError, complain
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -100,11 +99,5 @@ def _end(code: ExitCode, number: int, frame: object) -> None:
 
 
 def _refuse(message: str, exit_code: ExitCode) -> int:
-    with suppress(OSError):  # the terminal may be gone, as after SIGHUP
-        click.echo(f"sfm-audit: {_plain(message)}", err=True)
+    complain(message)
     return int(exit_code)
-
-
-def _plain(message: str) -> str:
-    """Return one line without control characters: names and locations come from others' data."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))

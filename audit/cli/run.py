@@ -9,7 +9,7 @@ from typing import Any, get_args
 import click
 
 from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
-from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
@@ -101,7 +101,7 @@ def command(  # one parameter per option
         lines, problems = listed(find_models(paths, wanted))
         print_page("\n".join(lines))
         for problem in problems:
-            click.echo(f"sfm-audit: {problem}", err=True)
+            complain(problem)
         return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
     if out is None:
         raise click.UsageError("Missing option '-o': the folder for the tables.")

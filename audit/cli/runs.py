@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
 from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
-from sfm_audit.reports.text.wording import plain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +63,7 @@ def open_run(folder: Path, *, quiet: bool = False) -> RunReader:
     """
     run = RunReader.open(folder)
     if run.note is not None and not quiet:
-        print(f"sfm-audit: {plain(str(folder))} {run.note}", file=sys.stderr)
+        complain(f"{folder} {run.note}")
     return run
 
 

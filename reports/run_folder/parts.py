@@ -79,9 +79,18 @@ def fits(path: Path, wanted: PartRecord) -> bool:
 
 
 def rows_of(part: pq.ParquetFile, table: str, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a part; ValueError where a column is not of its type or lacks what is never null."""
+    """Yield the rows of a part, without columns that it lacks, as one of another version may.
+
+    Raises
+    ------
+    ValueError
+        A column is not of its type, or lacks what is never null.
+    """
     types = _TYPES[table]  # type: ignore[index]
     found = part.schema_arrow
+    lost = sorted(_NEVER_NULL.get(table, frozenset()).intersection(columns) - set(found.names))
+    if lost:
+        raise ValueError(f"it has no column {lost[0]}")
     for name in columns:
         if name in types and name in found.names and found.field(name).type != types[name]:
             raise ValueError(f"its column {name} is of type {found.field(name).type}, not {types[name]}")

@@ -78,10 +78,15 @@ class RunReader:
                 yield from rows_of(part, table, columns)
 
     def parts(self, table: str, columns: Sequence[str]) -> Iterator[tuple[str, list[Row]]]:
-        """Yield name and rows of each part, in the order of their names; errors as of `rows`."""
+        """Yield name and rows of each part, in the order of their names, null where a column is not there.
+
+        Errors as of `rows`.
+        """
+        blank = dict.fromkeys(columns)
         for model in self.models():
             with self._part(table, model) as part:
-                yield part_path(self.folder, table, model.key).name, list(rows_of(part, table, columns))
+                rows = [blank | row for row in rows_of(part, table, columns)]
+            yield part_path(self.folder, table, model.key).name, rows
 
     def has_part(self, table: str, name: str) -> bool:
         """Whether the run has a part called ``name`` in this table."""
