@@ -17,7 +17,7 @@ PointsName = Literal["in-sample", "independent"]
 class AuditConfig(BaseModel):
     """Everything that changes a number in the tables (method.md's symbols in the descriptions)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     noise: NoiseName = Field(
         default="track",
@@ -36,6 +36,7 @@ class AuditConfig(BaseModel):
     )
     min_effect: str = Field(
         default=thresholds.MIN_EFFECT,
+        max_length=40,
         pattern=r"^(\d+(\.\d*)?|\.\d+)(px|sigma)$",
         description="tau: a significant misfit below it does not reject; in px, or in sigma of the image (0.5sigma)",
     )
@@ -47,11 +48,15 @@ class AuditConfig(BaseModel):
         default=thresholds.MAX_NOISE_DISTANCE.default, ge=0, lt=1, description=thresholds.MAX_NOISE_DISTANCE.meaning
     )
     min_observations: int = Field(
-        default=int(thresholds.MIN_OBSERVATIONS.default), ge=2, description=thresholds.MIN_OBSERVATIONS.meaning
+        default=int(thresholds.MIN_OBSERVATIONS.default),
+        ge=2,
+        le=1_000_000_000,
+        description=thresholds.MIN_OBSERVATIONS.meaning,
     )
     min_track_length: int = Field(
         default=3,
         ge=3,
+        le=1_000_000,
         description="observations of tracks with fewer audited observations cannot be verified",
     )
     min_track_eigenvalue: float = Field(
@@ -61,27 +66,33 @@ class AuditConfig(BaseModel):
         description="smaller eigenvalue of I - H below which an observation cannot be verified",
     )
     pose_offset_threshold_px: float = Field(
-        default=thresholds.MAX_POSE_OFFSET_PX.default, gt=0, description=thresholds.MAX_POSE_OFFSET_PX.meaning
+        default=thresholds.MAX_POSE_OFFSET_PX.default, gt=0, le=1e6, description=thresholds.MAX_POSE_OFFSET_PX.meaning
     )
     min_focal_over_size: float = Field(
-        default=thresholds.MIN_FOCAL_OVER_SIZE.default, gt=0, description=thresholds.MIN_FOCAL_OVER_SIZE.meaning
+        default=thresholds.MIN_FOCAL_OVER_SIZE.default, gt=0, le=1e6, description=thresholds.MIN_FOCAL_OVER_SIZE.meaning
     )
     max_focal_over_size: float = Field(
-        default=thresholds.MAX_FOCAL_OVER_SIZE.default, gt=0, description=thresholds.MAX_FOCAL_OVER_SIZE.meaning
+        default=thresholds.MAX_FOCAL_OVER_SIZE.default, gt=0, le=1e6, description=thresholds.MAX_FOCAL_OVER_SIZE.meaning
     )
     max_sd_focal_rel: float = Field(
-        default=thresholds.MAX_SD_FOCAL_REL.default, gt=0, description=thresholds.MAX_SD_FOCAL_REL.meaning
+        default=thresholds.MAX_SD_FOCAL_REL.default, gt=0, le=1e6, description=thresholds.MAX_SD_FOCAL_REL.meaning
     )
-    min_k1_sds: float = Field(default=thresholds.MIN_K1_SDS.default, gt=0, description=thresholds.MIN_K1_SDS.meaning)
+    min_k1_sds: float = Field(
+        default=thresholds.MIN_K1_SDS.default, gt=0, le=1e6, description=thresholds.MIN_K1_SDS.meaning
+    )
     min_coverage: float = Field(
-        default=thresholds.MIN_COVERAGE.default, ge=0, description=thresholds.MIN_COVERAGE.meaning
+        default=thresholds.MIN_COVERAGE.default, ge=0, le=1e6, description=thresholds.MIN_COVERAGE.meaning
     )
     min_occupied_cells: int = Field(
-        default=int(thresholds.MIN_OCCUPIED_CELLS.default), ge=0, description=thresholds.MIN_OCCUPIED_CELLS.meaning
+        default=int(thresholds.MIN_OCCUPIED_CELLS.default),
+        ge=0,
+        le=1_000_000,
+        description=thresholds.MIN_OCCUPIED_CELLS.meaning,
     )
     grid: int = Field(
         default=8,
         ge=1,
+        le=256,
         description="occupied_cells counts cells of a grid x grid division of the image",
     )
 

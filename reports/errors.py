@@ -18,6 +18,13 @@ class RunFolderError(Exception):
         return " ".join(f"{self.folder}: {self.problem}; {self.advice}".split())
 
 
+class DamagedRunError(RunFolderError):
+    """What the folder holds is not what a run wrote there; the message names the part."""
+
+    def __init__(self, folder: Path, problem: str) -> None:
+        super().__init__(folder, problem, "give its run command again, which audits what is damaged anew")
+
+
 class OutputError(Exception):
     """The operating system refused to write (no permission, disk full, a file where a folder should be)."""
 

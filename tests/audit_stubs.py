@@ -49,6 +49,34 @@ def break_down(task: Task) -> Outcome:
     return audit_one(task)
 
 
+def run_out_of_memory(task: Task) -> Outcome:
+    """Raise MemoryError on models of the scene called broken."""
+    if task.ref.scene == "broken":
+        raise MemoryError
+    return audit_one(task)
+
+
+def recurse(task: Task) -> Outcome:
+    """Call itself without end on models of the scene called broken."""
+    return recurse(task) if task.ref.scene == "broken" else audit_one(task)
+
+
+def sleep(task: Task) -> Outcome:
+    """Take a minute on models of the scene called broken."""
+    if task.ref.scene == "broken":
+        time.sleep(60)
+    return audit_one(task)
+
+
+def fill_memory(task: Task) -> Outcome:
+    """Take 3 GB, and keep them, on models of the scene called broken."""
+    if task.ref.scene == "broken":
+        held = [bytearray(b"x" * 50_000_000) for _ in range(60)]
+        time.sleep(30)
+        held.clear()
+    return audit_one(task)
+
+
 def lose_an_image_process(task: Task, mark: Path) -> Outcome:
     """Let one of the processes die over which the images are spread."""
     facts_of = engine._quality_of

@@ -11,21 +11,24 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.finding import Wanted, find_models
 from sfm_audit.audit.cli.progress import Progress
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.schedule.errors import ClusterError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
 from sfm_audit.audit.schedule.runner import audit_many
+from sfm_audit.audit.schedule.task import NO_LIMITS, Failure, Limits
 from sfm_audit.loaders import Discovery
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
-from sfm_audit.reports.run_folder.store import RunSettings, RunStore
+from sfm_audit.reports.run_folder.store import RunFailure, RunSettings, RunStore
 from sfm_audit.reports.text.drawing import Page
 from sfm_audit.reports.text.summary import render_summary
-from sfm_audit.reports.text.wording import plain
+
+_INPUT_KINDS: Final = frozenset({"unreadable", "too_large"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,8 @@ class RunRequest:
     jobs: number of processes, None for as many as there are CPUs and work for them.
     observations: whether to write a row per inlier too.
     dask: address of a Dask scheduler, or "local"; None without Dask.
-    wanted: which models below the PATHs.    max_model_bytes: a larger one is not loaded; None for no limit.
+    wanted: which models below the PATHs.
+    limits: what the audit of one may take.    verify: whether to read unchanged inputs again.
     """
 
     paths: Sequence[str]
@@ -46,7 +50,8 @@ class RunRequest:
     observations: bool = False
     dask: str | None = None
     wanted: Wanted = field(default_factory=Wanted)
-    max_model_bytes: int | None = None
+    limits: Limits = NO_LIMITS
+    verify: bool = False
 
 
 def run_audit(request: RunRequest) -> ExitCode:
@@ -61,22 +66,39 @@ def run_audit(request: RunRequest) -> ExitCode:
         raise KnownError("--dask needs the extra cluster: pip install 'sfm-audit[cluster]'", ExitCode.USAGE)
     start = time.perf_counter()
     found = find_models(request.paths, request.wanted)
-    problems = [(error.path, str(error)) for error in found.errors]
+    problems = [RunFailure(error.path, str(error)) for error in found.errors]
     if found.refs:
         try:
-            problems += _write_run(request, found, start)
+            _write_run(request, found, problems, start)
         except (RunFolderError, ClusterError) as error:
             raise KnownError(str(error), ExitCode.USAGE) from error
         except OutputError as error:
-            raise KnownError(str(error), ExitCode.OUTPUT) from error
-    for _, message in problems:
-        print(f"sfm-audit: {plain(message)}", file=sys.stderr)
-    return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
+            raise KnownError(str(error), max(ExitCode.OUTPUT, _say(problems, request.folder))) from error
+    return _say(problems, request.folder)
+
+
+def _say(problems: Sequence[RunFailure], folder: Path) -> ExitCode:
+    """Print a line on stderr per problem; return the highest exit code of them."""
+    codes = [ExitCode.OK]
+    for problem in problems:
+        where = f" ({folder / problem.report})" if problem.report else ""
+        complain(problem.message + where)
+        codes.append(ExitCode.UNREADABLE_INPUT if problem.kind in _INPUT_KINDS else ExitCode.AUDIT_STOPPED)
+    return max(codes)
 
 
 def print_summary(folder: Path) -> None:
-    """Print the summary of a run folder."""
-    print_page(render_summary(RunReader.open(folder), terminal_page()))
+    """Print the summary of a run folder.
+
+    Raises
+    ------
+    KnownError
+        It holds no run that can be read.
+    """
+    try:
+        print_page(render_summary(RunReader.open(folder), terminal_page()))
+    except RunFolderError as error:
+        raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
 
 
 def print_page(text: str) -> None:
@@ -97,8 +119,9 @@ def terminal_page() -> Page:
     )
 
 
-def _write_run(request: RunRequest, found: Discovery, start: float) -> list[tuple[str, str]]:
-    problems = [(error.path, str(error)) for error in found.errors]
+def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure], start: float) -> None:
+    """Audit into the run folder; what goes wrong with a model is added to ``problems`` at once, in the end in order."""
+    before = list(problems)
     settings = RunSettings(
         importlib.metadata.version("sfm-audit"),
         request.config.model_dump(),
@@ -109,6 +132,10 @@ def _write_run(request: RunRequest, found: Discovery, start: float) -> list[tupl
     silent = request.quiet or not sys.stderr.isatty()
     store = RunStore(request.folder, settings)
     store.refuse_to_forget(found.left_out)
+
+    def as_said(failure: Failure) -> RunFailure:
+        return RunFailure(failure.location, failure.message, failure.kind, store.reports.get(failure.location))
+
     with store, Progress(found.refs, silent=silent) as progress:
         failures = audit_many(
             found.refs,
@@ -117,15 +144,16 @@ def _write_run(request: RunRequest, found: Discovery, start: float) -> list[tupl
             sink=store,
             on_done=progress.advance,
             on_skip=progress.skip,
+            on_failure=lambda failure: problems.append(as_said(failure)),
             observations=request.observations,
             dask=request.dask,
-            max_model_bytes=request.max_model_bytes,
+            limits=request.limits,
+            verify=request.verify,
         )
-        own = [(failure.location, failure.message) for failure in failures]
+        problems[:] = [*before, *map(as_said, failures)]
         # a PATH that is not there today, such as a disk that is not mounted, does not cost the tables made from it
         keep = None if found.errors else [ref.key for ref in found.refs]
-        store.finish(keep, [*problems, *own], time.perf_counter() - start)
-    return own
+        store.finish(keep, problems, time.perf_counter() - start)
 
 
 def _paths_without_models(paths: Sequence[str], found: Discovery) -> frozenset[str]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import datetime as dt
 import importlib.metadata
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import click
 
 from sfm_audit.audit.cli.auditing import print_page, terminal_page
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.gate_file import read_gate_file
 from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
 from sfm_audit.reports.compare.comparison import compare
@@ -109,6 +108,6 @@ def _write_all(report: GateReport, files: list[tuple[Path | None, Callable[[Gate
         except KnownError as error:
             problems.append(error)
     for problem in problems[1:]:
-        print(f"sfm-audit: {problem}", file=sys.stderr)
+        complain(str(problem))
     if problems:
         raise problems[0]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
 from sfm_audit.audit.cli.auditing import print_page, terminal_page
-from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.runs import different_settings, read_run
 from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.page import render_comparison
-from sfm_audit.reports.text.wording import plain
 
 
 @click.command("diff", short_help="Show what changed between two runs.")
@@ -29,7 +27,7 @@ def command(*, before: Path, after: Path, exit_code: bool) -> ExitCode:
     runs = [read_run(before), read_run(after)]
     problem = different_settings(runs)
     if problem:
-        print(f"sfm-audit: {plain(problem)}: verdicts differ for that reason too", file=sys.stderr)
+        complain(f"{problem}: verdicts differ for that reason too")
     comparison = compare(runs[0].snapshot, runs[1].snapshot)
     print_page(render_comparison(comparison, (str(before), str(after)), terminal_page()))
     is_changed = any(change.anything for change in comparison.changes)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from enum import IntEnum
+from typing import Final
+
+_MAX_CHARACTERS: Final = 900  # of one line
 
 
 class ExitCode(IntEnum):
@@ -13,7 +18,18 @@ class ExitCode(IntEnum):
     USAGE = 2  # wrong usage or config; the run folder is in use or holds another run
     UNREADABLE_INPUT = 3  # some input could not be read or holds no model; the rest was audited and written
     OUTPUT = 4  # the output could not be written; finished parts stay
-    INTERRUPTED = 130  # as shells have it for SIGINT
+    AUDIT_STOPPED = 5  # a bug or a limit stopped single models; all others were audited and written
+    HANGUP = 129  # as shells have it for SIGHUP, SIGINT and SIGTERM
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+
+class Ended(BaseException):
+    """A signal asked the process to end."""
+
+    def __init__(self, exit_code: ExitCode) -> None:
+        super().__init__(exit_code)
+        self.exit_code = exit_code
 
 
 class KnownError(Exception):
@@ -26,3 +42,13 @@ class KnownError(Exception):
 
     def __str__(self) -> str:
         return " ".join(self.message.split())
+
+
+def complain(message: str) -> None:
+    """Say something on stderr in one line that is safe to print: names and locations come from others' data."""
+    line = " ".join(message.split())
+    if len(line) > _MAX_CHARACTERS:
+        line = f"{line[: _MAX_CHARACTERS * 2 // 3]} ... {line[-_MAX_CHARACTERS // 3 :]}"
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in line)
+    with contextlib.suppress(OSError):  # the terminal may be gone, as after SIGHUP
+        print(f"sfm-audit: {line}", file=sys.stderr, flush=True)

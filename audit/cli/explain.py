@@ -80,6 +80,11 @@ def _location(model: str) -> str:
 
 
 def _image_idx(model: SparseModel, image: str) -> int:
+    same = [i for i, name in enumerate(model.images.name) if name == image]
+    if len(same) > 1:
+        ids = ", ".join(f"id:{model.images.image_id[i]}" for i in same[:3])
+        problem = f"{model.location}: has {len(same)} images called {plain(image)!r}; name one by its id ({ids} ...)"
+        raise KnownError(problem, ExitCode.USAGE)
     try:
         return model.image_idx(image)
     except KeyError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,11 @@ from typing import Final
 import click
 import numpy as np
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
+from sfm_audit.audit.cli.runs import open_run
 from sfm_audit.loaders import LoadError, open_model
 from sfm_audit.loaders.scene_info.file import read_scene_info
-from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
 from sfm_audit.reports.export.pruned_model import MODEL_FILES, plan_pruning, write_pruned
 from sfm_audit.reports.export.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
 from sfm_audit.reports.export.selection import (
@@ -117,11 +117,13 @@ def _check_outputs(outputs: Sequence[Path], inputs: Sequence[Path], model_out: P
 
 def _open(run_folder: Path, keep: Keep) -> _Request:
     try:
-        run = RunReader.open(run_folder)
+        run = open_run(run_folder)
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     try:
         return _Request(run, read_images(run), keep)
+    except DamagedRunError as error:
+        raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.USAGE) from error
 
@@ -135,11 +137,13 @@ def _run(steps: Sequence[Callable[[], str]]) -> ExitCode:
             continue
         except LoadError as error:
             message, code = str(error), ExitCode.UNREADABLE_INPUT
+        except DamagedRunError as error:
+            message, code = str(error), ExitCode.UNREADABLE_INPUT
         except RunFolderError as error:
             message, code = str(error), ExitCode.USAGE
         except OutputError as error:
             message, code = str(error), ExitCode.OUTPUT
-        print(f"sfm-audit: {plain(message)}", file=sys.stderr)
+        complain(message)
         codes.append(code)
     return max(codes)
 
@@ -161,6 +165,11 @@ def _write_model(request: _Request, model_folder: Path, out: Path) -> str:
             write_pruned(model, pruning, folder)
         except OSError as error:
             raise OutputError(out, error.strerror or str(error)) from error
+        except LoadError as error:
+            if not Path(error.path).is_relative_to(folder):
+                raise
+            reason = f"what was written cannot be read again: found {error.got}"  # pycolmap does not say a full disk
+            raise OutputError(out, reason) from error
         write_file(_removed_path(out), as_bytes(removed_text(removed)))
     num_points, num_kept = len(model.points), int(np.count_nonzero(pruning.keeps_point))
     num_cut = int(np.count_nonzero(~pruning.keeps_observation))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.toml_file import read_toml, shown
 from sfm_audit.audit.table.words import ReasonCode
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits, PartPolicy
 
@@ -30,12 +30,7 @@ def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
         It cannot be read, has an unknown key or reason code, a value of the wrong kind, or a limit that needs a
         baseline where there is none.
     """
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise KnownError(f"{file}: cannot be read ({error.strerror})", ExitCode.USAGE) from error
-    except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError
-        raise KnownError(f"{file}: not a TOML file: {error}", ExitCode.USAGE) from error
+    content = read_toml(file)
     try:
         policy = GatePolicy.model_validate(content)
     except ValidationError as error:
@@ -43,7 +38,7 @@ def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
     codes = {str(code) for code in ReasonCode}
     for code in policy.reason_codes:
         if code not in codes:
-            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code}; docs/verdicts.md lists them"
+            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code[:80]}; docs/verdicts.md lists them"
             raise KnownError(problem, ExitCode.USAGE)
     if policy.needs_baseline and not has_baseline:
         raise KnownError(f"{file}: {policy.needs_baseline} needs --baseline RUN0", ExitCode.USAGE)
@@ -58,7 +53,7 @@ def _problem(detail: ErrorDetails) -> str:
     if detail["type"] == "missing":
         return f"{name} is missing"
     wanted = detail["msg"].removeprefix("Input should be ")
-    return f"{name}: expected {wanted}, found {detail['input']!r}"
+    return f"{name}: expected {wanted}, found {shown(detail['input'])}"
 
 
 def _dotted(parts: tuple[int | str, ...]) -> str:
@@ -66,4 +61,4 @@ def _dotted(parts: tuple[int | str, ...]) -> str:
     out = ""
     for part in parts:
         out += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
-    return out.removeprefix(".")
+    return out.removeprefix(".")[:80]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
 from sfm_audit.audit.cli.auditing import print_page
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
 from sfm_audit.reports.compare.learning import gate_toml, learn_bands
-from sfm_audit.reports.text.wording import plain
 
 _RECOMMENDED = 3
 
@@ -63,4 +61,4 @@ def _refuse_unusable(runs: list[ComparedRun]) -> None:
 
 
 def _warn(text: str) -> None:
-    print(f"sfm-audit: {plain(text)}", file=sys.stderr)
+    complain(text)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Final, cast
 
 import click
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import Ended, ExitCode, KnownError, complain
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -22,6 +24,15 @@ VERBS: Final = {
     "calibrate": "Estimate cameras from 2D-3D correspondences and validate each.",
     "simulate": "Write 2D-3D correspondences with known truth.",
     "demo": "Audit simulated photos with planted defects; needs no data.",
+}
+
+
+_SIGNALS: Final = {"SIGTERM": ExitCode.TERMINATED, "SIGHUP": ExitCode.HANGUP}
+_GOES_ON: Final = "what was finished stays, the same command goes on"
+_WORDS: Final = {
+    ExitCode.INTERRUPTED: f"interrupted; {_GOES_ON}",
+    ExitCode.TERMINATED: f"ended by SIGTERM; {_GOES_ON}",
+    ExitCode.HANGUP: f"ended by SIGHUP; {_GOES_ON}",
 }
 
 
@@ -62,7 +73,9 @@ def main(args: Sequence[str]) -> int:
     except KnownError as error:
         return _refuse(str(error), error.exit_code)
     except click.Abort:
-        return _refuse("interrupted; what was finished stays, the same command goes on", ExitCode.INTERRUPTED)
+        return _refuse(_WORDS[ExitCode.INTERRUPTED], ExitCode.INTERRUPTED)
+    except Ended as ended:
+        return _refuse(_WORDS[ended.exit_code], ended.exit_code)
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         advice = f" (see {context.command_path} --help)" if context else ""
@@ -71,10 +84,20 @@ def main(args: Sequence[str]) -> int:
 
 
 def entry_point() -> None:
-    """Run the command that the shell gave."""
+    """Run the command that the shell gave; a signal that asks for the end ends it as an interrupt does."""
+    for name, code in _SIGNALS.items():
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores SIGHUP, and so do we
+            signal.signal(number, partial(_end, code))
     sys.exit(main(sys.argv[1:]))
 
 
+def _end(code: ExitCode, number: int, frame: object) -> None:
+    del frame
+    signal.signal(number, signal.SIG_DFL)  # a second one does not wait for us to clean up
+    raise Ended(code)
+
+
 def _refuse(message: str, exit_code: ExitCode) -> int:
-    click.echo(f"sfm-audit: {' '.join(message.split())}", err=True)
+    complain(message)
     return int(exit_code)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
@@ -15,17 +16,25 @@ from sfm_audit.audit.table.thresholds import effect_px
 from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
 from sfm_audit.loaders.formats import keypoint_scales_of
+from sfm_audit.loaders.paths.locations import RemotePath, parse_location
 from sfm_audit.reports.figures import ResidualError, Residuals
 from sfm_audit.reports.figures.residuals import principal_point, residuals_of_row
 from sfm_audit.reports.run_folder.reader import RunReader
 
+_OTHER_MACHINES: Final = ("//", "\\\\")  # opening such a path sends the user's name to a host, on Windows
+
 
 class ResidualSource:
-    """Finds the residuals of the images of a run: in the run itself, else in its models, one in memory at a time."""
+    """Finds the residuals of the images of a run: in the run itself, else in its models, one in memory at a time.
 
-    def __init__(self, run: RunReader) -> None:
+    A run folder is data: of what it names, only models on this machine are read, and their residuals only where the
+    files have the hash that the manifest knows. In an object store nothing is opened but what lies below ``named``, the
+    locations of the command line, and with their options.
+    """
+
+    def __init__(self, run: RunReader, named: Sequence[str] = ()) -> None:
         self._run = run
-        self._held = (run.folder / "observations").is_dir()
+        self._named = named
         self._last: tuple[str, ModelAuditor | ResidualError] | None = None
 
     def residuals(self, row: Mapping[str, Any]) -> Residuals:
@@ -35,9 +44,11 @@ class ResidualSource:
         ------
         ResidualError
             Neither the run nor the model has them; one line says why.
+        RunFolderError
+            The part of the run that has them is damaged.
         """
-        if self._held and (self._run.folder / "observations" / row["part"]).exists():
-            return residuals_of_row(self._run.folder, row["part"], row)
+        if self._run.has_part("observations", row["part"]):
+            return residuals_of_row(self._run, row["part"], row)
         auditor = self._auditor(row["model_path"])
         found = np.flatnonzero(auditor.model.images.image_id == row["image_id"])
         if not len(found):
@@ -57,11 +68,11 @@ class ResidualSource:
         return found
 
     def _open(self, model_path: str) -> ModelAuditor:
-        location = _location(self._run, model_path)
-        known = {item["model_path"]: item["sha256"] for item in self._run.info.get("inputs", [])}
         advice = "run again with --observations to keep the residuals with the run"
+        known = next((each.sha256 for each in self._run.models() if each.model_path == model_path), None)
         try:
-            if model_path in known and read_input_state(location).digest != known[model_path]:
+            location = allowed_location(self._run.info["paths"], model_path, self._named)
+            if read_input_state(location).digest != known:
                 raise ResidualError(f"{model_path}: the model changed since the run; {advice}")
             model = open_model(location)
             return auditor_of(model, AuditConfig.model_validate(self._run.info["config"]))
@@ -100,14 +111,45 @@ def image_residuals_of(auditor: ModelAuditor, image_idx: int, row: Mapping[str, 
     )
 
 
-def _location(run: RunReader, model_path: str) -> str:
-    """Return where the model of a row lies: the real path of the PATH it was found under, and what is below that."""
-    for path in run.info.get("paths", []):
-        given = str(path["given"])
+def allowed_location(paths: Sequence[Mapping[str, str]], model_path: str, named: Sequence[str]) -> str:
+    """Return where a model of a run may be read.
+
+    Parameters
+    ----------
+    paths : the PATHs of the run with their real locations; data, as ``model_path`` is
+    named : what the command line names
+
+    Raises
+    ------
+    ResidualError
+        It lies in an object store (or on another machine), and the command line does not name it.
+    LoadError
+        It is no location.
+    """
+    location = _recorded_location(paths, model_path)
+    found = parse_location(location)
+    if isinstance(found, RemotePath):
+        for given in map(parse_location, named):
+            if isinstance(given, RemotePath) and (given.scheme, *given.parts) == (
+                found.scheme,
+                *found.parts[: len(given.parts)],
+            ):
+                return str(replace(found, options=given.options))
+        problem = f"{found.scheme}://{found.key}: is not opened because a run folder says so; name it with --model"
+        raise ResidualError(problem)
+    if location.startswith(_OTHER_MACHINES) or "\0" in location:
+        raise ResidualError(f"{location}: is no path of this machine; nothing is opened there")
+    return location
+
+
+def _recorded_location(paths: Sequence[Mapping[str, str]], model_path: str) -> str:
+    """Return where the model of a row lay: the real path of the PATH it was found under, and what is below that."""
+    for path in paths:
+        given, real = path["given"], path["real"]
         if model_path == given:
-            return str(path["real"])
+            return real
         if model_path.startswith(given.rstrip("/") + "/"):
-            return f"{str(path['real']).rstrip('/')}/{model_path[len(given.rstrip('/')) + 1 :]}"
+            return f"{real.rstrip('/')}/{model_path[len(given.rstrip('/')) + 1 :]}"
     return model_path
 
 

@@ -10,9 +10,9 @@ import click
 from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
+from sfm_audit.audit.cli.runs import open_run
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.new_files import OutputExistsError, check_free, write_file
-from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.text.wording import counted, plain
 
 
@@ -23,13 +23,23 @@ from sfm_audit.reports.text.wording import counted, plain
 @click.option(
     "--worst", type=click.IntRange(0, 100), default=12, show_default=True, help="How many images get pictures."
 )
+@click.option(
+    "--model",
+    "models",
+    metavar="LOCATION",
+    multiple=True,
+    help="Models of RUN in this object store may be read; RUN alone opens none. Repeatable.",
+)
 @click.option("--force", is_flag=True, help="Replace the page if it is there.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
-def command(*, run: Path, out: Path, photos: Path | None, worst: int, force: bool, quiet: bool) -> ExitCode:
+def command(
+    *, run: Path, out: Path, photos: Path | None, worst: int, models: tuple[str, ...], force: bool, quiet: bool
+) -> ExitCode:
     """Write one HTML page about the run folder RUN: it needs no network and no other file.
 
     Pictures of the worst images are drawn from RUN/observations (run --observations), or from the models where they
-    still lie where the run read them. With --images, photos are found as DIR/<name> or DIR/<scene>/images/<name>.
+    still lie on this machine as the run read them. With --images, photos are found as DIR/<name> or
+    DIR/<scene>/images/<name>.
 
     Exit codes: 0 fine; 2 wrong usage, or the page exists; 3 RUN is no run folder or cannot be read; 4 the page could
     not be written.
@@ -38,10 +48,10 @@ def command(*, run: Path, out: Path, photos: Path | None, worst: int, force: boo
         check_free(out, force=force)
         if photos is not None and not photos.is_dir():
             raise KnownError(f"{photos}: is no folder; name the folder of the photos", ExitCode.USAGE)
-        reader = _open(run)
+        reader = open_run(run, quiet=quiet)
         with extra("report"):
             from sfm_audit.audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
-        page = make_page(reader, photos, worst, silent=quiet or not sys.stderr.isatty())
+        page = make_page(reader, photos, worst, models, silent=quiet or not sys.stderr.isatty())
         content = page.text.encode()
         write_file(out, content)
     except OutputExistsError as error:
@@ -54,12 +64,3 @@ def command(*, run: Path, out: Path, photos: Path | None, worst: int, force: boo
         what = f"{counted(page.num_images, 'image')}, pictures of {page.num_drawn}, {len(content) / 1e6:.1f} MB"
         print_page(f"{plain(str(out))}: {what}")
     return ExitCode.OK
-
-
-def _open(folder: Path) -> RunReader:
-    """Open a run folder, finished or not."""
-    run = RunReader.open(folder)
-    if not isinstance(run.info, dict) or not isinstance(run.info.get("config"), dict):
-        problem = "its run.json was not written by sfm-audit"
-        raise RunFolderError(folder, problem, "name the folder that run -o wrote")
-    return run

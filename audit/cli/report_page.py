@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +27,8 @@ class Made:
     num_drawn: int
 
 
-def make_page(run: RunReader, photos: Path | None, worst: int, *, silent: bool) -> Made:
-    """Read a run, draw its worst images and return the page.
+def make_page(run: RunReader, photos: Path | None, worst: int, named: Sequence[str] = (), *, silent: bool) -> Made:
+    """Read a run, draw its worst images and return the page; ``named``: locations of models on the command line.
 
     Raises
     ------
@@ -36,10 +37,10 @@ def make_page(run: RunReader, photos: Path | None, worst: int, *, silent: bool) 
     """
     try:
         content = html.read_content(run)
-    except (OSError, pa.ArrowException, KeyError) as error:  # KeyError: a column of another version is missing
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:  # a column or a word of another version
         what = f"its tables cannot be read ({' '.join(str(error).split())[:200]})"
         raise RunFolderError(run.folder, what, "audit again into a new folder") from error
-    source = ResidualSource(run)
+    source = ResidualSource(run, named)
     rows = content.rows[:worst]
     pictures = [html.ImagePictures()] * len(rows)
     # models are opened one after the other, each once, whatever the order of the images on the page

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
 from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
-from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
+from sfm_audit.audit.schedule.task import Limits
 from sfm_audit.audit.table.words import POLICIES
 
 _DEFAULTS = AuditConfig()
@@ -64,6 +66,19 @@ _DEFAULTS = AuditConfig()
     type=click.FloatRange(min=0, min_open=True),
     help="Refuse to load a model whose files are larger.  [default: no limit]",
 )
+@click.option(
+    "--max-model-memory",
+    metavar="GB",
+    type=click.FloatRange(min=0, min_open=True),
+    help="End the audit of a model whose process takes more memory.  [default: no limit]",
+)
+@click.option(
+    "--max-model-seconds",
+    metavar="S",
+    type=click.FloatRange(min=0, min_open=True),
+    help="End the audit of a model that takes longer.  [default: no limit]",
+)
+@click.option("--verify", is_flag=True, help="Read all inputs again, where otherwise size and time of change count.")
 @click.option("--observations", is_flag=True, help="Write RUN/observations too, one row per inlier.")
 @click.option("--list", "only_list", is_flag=True, help="Print the models that were found, audit nothing.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary; errors are still said.")
@@ -77,7 +92,8 @@ def command(  # one parameter per option
     twice.
 
     Exit codes: 0 fine; 2 wrong usage or config, or RUN is in use or holds another run; 3 some input could not be read
-    (the rest was audited and written); 4 RUN could not be written.
+    (the rest was audited and written); 4 RUN could not be written; 5 a bug or a limit stopped single models (traceback
+    in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
     config = read_config(config_file, {name: options[name] for name in ("noise", "points", "min_effect", "policy")})
     wanted = wanted_of(**{name: options[name] for name in ("layout", "scenes", "components", "scene_lists")})
@@ -85,11 +101,10 @@ def command(  # one parameter per option
         lines, problems = listed(find_models(paths, wanted))
         print_page("\n".join(lines))
         for problem in problems:
-            click.echo(f"sfm-audit: {problem}", err=True)
+            complain(problem)
         return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
     if out is None:
         raise click.UsageError("Missing option '-o': the folder for the tables.")
-    limit_gb = options["max_model_gb"]
     request = RunRequest(
         paths,
         out,
@@ -99,9 +114,20 @@ def command(  # one parameter per option
         options["observations"],
         options["dask"],
         wanted,
-        None if limit_gb is None else int(limit_gb * 1e9),
+        _limits(options["max_model_gb"], options["max_model_memory"], options["max_model_seconds"]),
+        options["verify"],
     )
     exit_code = run_audit(request)
     if not options["quiet"] and (out / "run.json").exists():
         print_summary(out)
     return exit_code
+
+
+def _limits(input_gb: float | None, memory_gb: float | None, seconds: float | None) -> Limits:
+    if memory_gb is not None and not Path("/proc/self/statm").exists():
+        raise click.UsageError("--max-model-memory: this operating system does not say how much a process has.")
+    return Limits(_bytes(input_gb), _bytes(memory_gb), seconds)
+
+
+def _bytes(gigabytes: float | None) -> int | None:
+    return None if gigabytes is None else int(min(gigabytes * 1e9, sys.maxsize))

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
 from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
@@ -38,20 +38,33 @@ def read_run(folder: Path) -> ComparedRun:
         It holds no run, one that was not finished, or tables that cannot be read.
     """
     try:
-        run = RunReader.open(folder)
+        run = open_run(folder)
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
-    if not isinstance(run.info, dict) or not isinstance(run.info.get("config"), dict):
-        problem = f"{folder}: its run.json was not written by sfm-audit; name the folder that run -o wrote"
-        raise KnownError(problem, ExitCode.UNREADABLE_INPUT)
     if run.info.get("status") != "complete":
         problem = f"{folder}: the run was not finished; give its run command again, it goes on where it stopped"
         raise KnownError(problem, ExitCode.UNREADABLE_INPUT)
     try:
         return ComparedRun(folder, run.info, RunSnapshot.read(run))
-    except (pa.ArrowException, OSError, MissingColumnError) as error:
+    except RunFolderError as error:
+        raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
+    except (pa.ArrowException, OSError, MissingColumnError, ValueError) as error:
         problem = f"{folder}: its tables cannot be read ({error}); make the run again"
         raise KnownError(problem, ExitCode.UNREADABLE_INPUT) from error
+
+
+def open_run(folder: Path, *, quiet: bool = False) -> RunReader:
+    """Open a run folder, finished or not; a line on stderr says where it could only be checked in part.
+
+    Raises
+    ------
+    RunFolderError
+        It holds no run, or one that was changed.
+    """
+    run = RunReader.open(folder)
+    if run.note is not None and not quiet:
+        complain(f"{folder} {run.note}")
+    return run
 
 
 def different_settings(runs: Sequence[ComparedRun]) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -11,8 +10,10 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.toml_file import read_toml, shown
 from sfm_audit.audit.config import AuditConfig
 
+_SHOWN: Final = 80  # characters of a name
 _CROSS_FIELD: Final = "value_error"  # a rule about several settings, each of which is valid by itself
 _PATTERNS: Final = {"min_effect": "a number with its unit, such as 0.2px or 0.5sigma"}
 
@@ -32,7 +33,7 @@ def read_config(file: Path | None, options: Mapping[str, Any]) -> AuditConfig:
         kind; or settings contradict each other. The message names the file or the option.
     """
     said = {name: value for name, value in options.items() if value is not None}
-    from_file = {} if file is None else _read_toml(file)
+    from_file = {} if file is None else read_toml(file)
     if file is not None:
         _refuse_wrong_values(from_file, lambda name: f"{file}: {name}")
     _refuse_wrong_values(said, _option)
@@ -42,15 +43,6 @@ def read_config(file: Path | None, options: Mapping[str, Any]) -> AuditConfig:
         sources = [*([str(file)] if from_file else []), *(_option(name) for name in said)]
         problem = error.errors()[0]["msg"].removeprefix("Value error, ")
         raise KnownError(f"{', '.join(sources)}: {problem}", ExitCode.USAGE) from error
-
-
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise KnownError(f"{file}: cannot be read ({error.strerror})", ExitCode.USAGE) from error
-    except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError
-        raise KnownError(f"{file}: not a TOML file: {error}", ExitCode.USAGE) from error
 
 
 def _refuse_wrong_values(content: Mapping[str, Any], place: Callable[[str], str]) -> None:
@@ -67,14 +59,14 @@ def _refuse_wrong_values(content: Mapping[str, Any], place: Callable[[str], str]
 
 
 def _problem(detail: ErrorDetails, place: Callable[[str], str]) -> str:
-    name = ".".join(str(part) for part in detail["loc"])
+    name = ".".join(str(part) for part in detail["loc"])[:_SHOWN]
     if detail["type"] == "extra_forbidden":
         where = place(name).removesuffix(name)
         return f"{where}unknown setting {name}; expected one of {', '.join(AuditConfig.model_fields)}"
     wanted = detail["msg"].removeprefix("Input should be ")
     if detail["type"] == "string_pattern_mismatch":
         wanted = _PATTERNS[name]
-    return f"{place(name)}: expected {wanted}, found {detail['input']!r}"
+    return f"{place(name)}: expected {wanted}, found {shown(detail['input'])}"
 
 
 def _option(name: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
+import multiprocessing
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
@@ -17,6 +18,9 @@ from distributed import Client, KilledWorker, LocalCluster, as_completed
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.schedule.errors import ClusterError
+from sfm_audit.audit.schedule.guard import guarded
+from sfm_audit.audit.schedule.lanes import Died, Lanes
+from sfm_audit.audit.schedule.processes import in_one_process
 from sfm_audit.audit.schedule.task import AuditFunction, Outcome, Task, died_twice
 
 LOCAL: Final = "local"
@@ -108,7 +112,12 @@ def _audit_there(audit: AuditFunction, task: Task, version: str) -> Outcome:
         advice = "install the same version on all machines"
         raise ClusterError(f"a Dask worker has sfm-audit {own}, this machine {version}; {advice}")
     threadpool_limits(limits=1)
-    return audit(task)
+    if not task.limits.need_a_process:
+        return guarded(audit, task)
+    multiprocessing.current_process().daemon = False  # workers are, and those may start no processes
+    with Lanes[Task]() as lanes:
+        answer = in_one_process(lanes, audit, task)
+    return died_twice(task, str(answer)) if isinstance(answer, Died) else answer
 
 
 @contextmanager

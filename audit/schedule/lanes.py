@@ -11,18 +11,23 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, Literal, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
 _BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _LEAVING_SECONDS: Final = 5.0  # that an idle process may take to leave before it is made to
+
+_LOOK_SECONDS: Final = 0.02  # between two looks at a call with limits: 100 MB at the speed at which memory is taken
+_PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 
 K = TypeVar("K")
 
@@ -37,6 +42,17 @@ class Died:
         if self.exit_code is not None and self.exit_code < 0:
             return f"killed by {signal.Signals(-self.exit_code).name}"
         return f"exit code {self.exit_code}"
+
+
+@dataclass(frozen=True, slots=True)
+class Exceeded:
+    """The answer of a process that was ended because its call took more memory or time than it may; amount: of that."""
+
+    kind: Literal["memory", "time"]
+    amount: float
+
+    def __str__(self) -> str:
+        return f"{self.amount / 1e9:.3g} GB of memory" if self.kind == "memory" else f"{self.amount:.3g} seconds"
 
 
 class ProcessDiedError(RuntimeError):
@@ -56,10 +72,30 @@ class _Raised:
     trace: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """Sent before a call begins."""
+
+
 @dataclass(slots=True, eq=False)
 class _Lane:
     process: multiprocessing.process.BaseProcess
     connection: Connection
+    max_bytes: int | None = None
+    max_seconds: float | None = None
+    begun: float | None = None  # when the call did: the start of the process and its imports are not its own
+
+    def excess(self) -> Exceeded | None:
+        """Say what the call under way has taken too much of; None while it has not."""
+        if self.max_seconds is not None and self.begun is not None:
+            seconds = time.monotonic() - self.begun
+            if seconds > self.max_seconds:
+                return Exceeded("time", seconds)
+        if self.max_bytes is not None and self.process.pid is not None:
+            num_bytes = resident_bytes(self.process.pid)
+            if num_bytes > self.max_bytes:
+                return Exceeded("memory", num_bytes)
+        return None
 
 
 class Lanes(Generic[K]):
@@ -91,6 +127,17 @@ class Lanes(Generic[K]):
                 lane.process.join()
         self._idle, self._busy = [], {}
 
+    def _end_those_over_their_limits(self) -> list[tuple[K, Any]]:
+        found = [(connection, *held, held[0].excess()) for connection, held in self._busy.items()]
+        ended = []
+        for connection, lane, key, excess in found:
+            if excess is not None:
+                del self._busy[connection]
+                lane.process.kill()
+                _bury(lane)
+                ended.append((key, excess))
+        return ended
+
     @property
     def num_busy(self) -> int:
         """How many calls are under way."""
@@ -102,6 +149,12 @@ class Lanes(Generic[K]):
 
     def start(self, key: K, function: Callable[..., Any], *arguments: Any) -> None:
         """Run a call in an idle process, or in a new one; the function must be importable by name."""
+        self.start_limited(key, (None, None), function, *arguments)
+
+    def start_limited(
+        self, key: K, limits: tuple[int | None, float | None], function: Callable[..., Any], *arguments: Any
+    ) -> None:
+        """Run a call that may take so many bytes of memory and so many seconds; where it takes more, it is ended."""
         while True:
             lane = self._idle.pop() if self._idle else _open_lane()
             try:
@@ -109,27 +162,50 @@ class Lanes(Generic[K]):
             except (BrokenPipeError, ConnectionError):  # killed while it was idle
                 _bury(lane)
                 continue
+            lane.max_bytes, lane.max_seconds = limits
+            lane.begun = None
             self._busy[lane.connection] = (lane, key)
             return
 
     def wait(self) -> list[tuple[K, Any]]:
         """Wait until a call ends; return key and answer of all that have ended, Died for those whose process died.
 
-        An error that a call raises is raised here.
+        An error that a call raises is raised here. A call that exceeds its limits is ended, the answer is Exceeded.
         """
+        answers: list[tuple[K, Any]] = []
+        while not answers:
+            is_limited = any(lane.max_bytes or lane.max_seconds for lane, _ in self._busy.values())
+            ready = wait(list(self._busy), _LOOK_SECONDS if is_limited else None)
+            answers = self._answers_of(ready) or self._end_those_over_their_limits()
+        return answers
+
+    def _answers_of(self, ready: Iterable[Any]) -> list[tuple[K, Any]]:
         answers = []
-        for connection in wait(list(self._busy)):
-            lane, key = self._busy.pop(connection)  # type: ignore[call-overload]
+        for connection in ready:
+            lane, key = self._busy[connection]
             try:
                 answer = lane.connection.recv()
             except (EOFError, OSError):
                 answer = _bury(lane)
-            else:
+            if isinstance(answer, _Begun):
+                lane.begun = time.monotonic()
+                continue
+            del self._busy[connection]
+            if not lane.connection.closed:
                 self._idle.append(lane)
             if isinstance(answer, _Raised):
                 raise answer.error from RemoteTracebackError(answer.trace)
             answers.append((key, answer))
         return answers
+
+
+def resident_bytes(pid: int) -> int:
+    """Return how much memory a process has, 0 where it is gone or the operating system does not say."""
+    try:
+        text = Path(f"/proc/{pid}/statm").read_text(encoding="ascii")
+    except OSError:
+        return 0
+    return int(text.split()[1]) * _PAGE_BYTES
 
 
 def _open_lane() -> _Lane:
@@ -161,6 +237,7 @@ def _serve(connection: Connection) -> None:
             return
         threadpool_limits(limits=1)  # for those that are loaded
         try:
+            connection.send(_Begun())
             answer = function(*arguments)
         except BaseException as error:  # noqa: BLE001 - raised again in the parent
             answer = _Raised(error, "".join(traceback.format_exception(error)))

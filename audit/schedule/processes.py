@@ -7,7 +7,8 @@ from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Final
 
-from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
+from sfm_audit.audit.schedule.guard import exceeded, guarded
+from sfm_audit.audit.schedule.lanes import Died, Exceeded, Lanes, ProcessDiedError
 from sfm_audit.audit.schedule.task import AuditFunction, Outcome, Task, died_twice
 
 BYTES_WORTH_A_PROCESS: Final = 50_000_000  # of input: two seconds of work; a process costs one
@@ -30,20 +31,36 @@ def in_processes(plan: Sequence[Task], jobs: int, audit: AuditFunction) -> Gener
             while waiting and num_at_work + waiting[0].num_processes <= jobs:
                 task = waiting.popleft()
                 num_at_work += task.num_processes
-                lanes.start(task, _call, audit, task)
+                _start(lanes, audit, task)
             yield from ended  # what the caller does with them is done while the processes work on
             ended = []
             for task, answer in lanes.wait():
                 num_at_work -= task.num_processes
                 if isinstance(answer, Died):
                     again.append(replace(task, num_processes=1))
+                elif isinstance(answer, Exceeded):
+                    ended.append((task, exceeded(task, answer)))
                 else:
                     ended.append((task, answer))
         yield from ended
         for task in again:
-            lanes.start(task, _call, audit, task)
-            ((_, answer),) = lanes.wait()
-            yield task, died_twice(task, str(answer)) if isinstance(answer, Died) else answer
+            yield task, _last_try(lanes, audit, task)
+
+
+def in_one_process(lanes: Lanes[Task], audit: AuditFunction, task: Task) -> Outcome | Died:
+    """Audit one model in another process within its limits, and wait for it."""
+    _start(lanes, audit, task)
+    ((_, answer),) = lanes.wait()
+    return exceeded(task, answer) if isinstance(answer, Exceeded) else answer
+
+
+def _last_try(lanes: Lanes[Task], audit: AuditFunction, task: Task) -> Outcome:
+    answer = in_one_process(lanes, audit, task)
+    return died_twice(task, str(answer)) if isinstance(answer, Died) else answer
+
+
+def _start(lanes: Lanes[Task], audit: AuditFunction, task: Task) -> None:
+    lanes.start_limited(task, (task.limits.memory_bytes, task.limits.seconds), _call, audit, task)
 
 
 def planned(tasks: Sequence[Task], jobs: int) -> list[Task]:
@@ -55,6 +72,8 @@ def planned(tasks: Sequence[Task], jobs: int) -> list[Task]:
     total = max(1, sum(task.ref.num_bytes for task in tasks))
 
     def share(task: Task) -> int:
+        if task.limits.memory_bytes is not None:  # a limit holds for one process, not for several that share pages
+            return 1
         return max(1, min(jobs * task.ref.num_bytes // total, task.ref.num_bytes // BYTES_WORTH_A_SHARE))
 
     ordered = sorted(tasks, key=lambda task: -task.ref.num_bytes)
@@ -63,6 +82,6 @@ def planned(tasks: Sequence[Task], jobs: int) -> list[Task]:
 
 def _call(audit: AuditFunction, task: Task) -> Outcome | Died:
     try:
-        return audit(task)
+        return guarded(audit, task)
     except ProcessDiedError:  # one of those over which the images were spread
         return Died(None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import pyarrow as pa
 
@@ -16,13 +17,42 @@ from sfm_audit.loaders import LoadError, ModelRef, open_model
 from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
 from sfm_audit.loaders.formats import keypoint_scales_of
 
+FailureKind = Literal["unreadable", "too_large", "memory", "time", "died", "error"]
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A model that could not be audited: its location as given, and one line that says why."""
+    """A model that was not audited.
+
+    location: as given.    message: one line that says why, and what to do.
+    kind: its input cannot be read, or is larger than is loaded; or memory, time, a dead process or a bug ended its
+    audit.    report: of a bug, what a developer needs: versions, settings, traceback.
+    """
 
     location: str
     message: str
+    kind: FailureKind = "unreadable"
+    report: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the audit of one model may take; None: as much as it wants.
+
+    input_bytes: a larger model is not loaded.    memory_bytes: of its process as a whole.    seconds: from its start.
+    """
+
+    input_bytes: int | None = None
+    memory_bytes: int | None = None
+    seconds: float | None = None
+
+    @property
+    def need_a_process(self) -> bool:
+        """Whether the audit has to be watched from another process."""
+        return self.memory_bytes is not None or self.seconds is not None
+
+
+NO_LIMITS: Final = Limits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +62,7 @@ class Task:
     known_digest: of the input it was last audited with; None when there is no such audit.
     observations: whether to make the table of observations too.
     num_processes: over which its images are spread.
+    limits: what its audit may take; enforced from another process.
     """
 
     ref: ModelRef
@@ -39,6 +70,12 @@ class Task:
     known_digest: str | None
     observations: bool = False
     num_processes: int = 1
+    limits: Limits = NO_LIMITS
+
+    @property
+    def is_too_large(self) -> bool:
+        """Whether the model is not even loaded."""
+        return self.limits.input_bytes is not None and self.ref.num_bytes > self.limits.input_bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +97,7 @@ AuditFunction = Callable[[Task], Outcome]
 
 
 def audit_one(task: Task) -> Outcome:
-    """Load and audit one model; a model that cannot be read is a Failure, any other error is raised."""
+    """Load and audit one model; a model that cannot be read is a Failure, any other error is raised (see `guarded`)."""
     start = time.perf_counter()
     ref = task.ref
     with image_processes(task.num_processes) as spread:  # they start while the model is read
@@ -72,24 +109,30 @@ def audit_one(task: Task) -> Outcome:
             scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
         except LoadError as error:
             return Failure(ref.model_path, str(error))
+        except MemoryError:
+            return _too_large_to_read(task)
         labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
-        try:
-            audited = audit_model(model, task.config, labels, scale_px, observations=task.observations, spread=spread)
-        except BaseException as error:
-            error.add_note(f"while auditing {ref.model_path}")
-            raise
+        audited = audit_model(model, task.config, labels, scale_px, observations=task.observations, spread=spread)
     return Audited(state, audited.tables, time.perf_counter() - start)
 
 
-def too_large(ref: ModelRef, max_bytes: int) -> Failure:
+def too_large(task: Task) -> Failure:
     """Return the failure of a model that is not loaded because of its size."""
+    ref, max_bytes = task.ref, task.limits.input_bytes or 0
     got, limit = f"{ref.num_bytes / 1e9:.3g} GB of files", f"at most {max_bytes / 1e9:.3g} GB"
     advice = "raise --max-model-gb where there is memory for it"
-    return Failure(ref.model_path, f"{ref.model_path}: expected {limit}, found {got}; {advice}")
+    return Failure(ref.model_path, f"{ref.model_path}: expected {limit}, found {got}; {advice}", "too_large")
+
+
+def _too_large_to_read(task: Task) -> Failure:
+    path, size = task.ref.model_path, f"{task.ref.num_bytes / 1e9:.3g} GB of files"
+    advice = "run it where there is more, or leave such models out with --max-model-gb"
+    return Failure(path, f"{path}: memory was too short to read its {size}; {advice}", "too_large")
 
 
 def died_twice(task: Task, how: str) -> Failure:
     """Return the failure of a model whose process died a second time."""
     path = task.ref.model_path
     what = f"the process that audited it died twice, the second time with no other beside it ({how})"
-    return Failure(path, f"{path}: {what}; memory may be short (see dmesg), run it again where there is more")
+    advice = "memory may be short (see dmesg): run it again where there is more, or with --max-model-memory"
+    return Failure(path, f"{path}: {what}; {advice}", "died")

@@ -27,6 +27,7 @@ _ONE_IMAGE: Final = frozenset({"newly_rejected", "share_accepted", "share_reject
 _COUNTS: Final = frozenset({"lost_scenes", "lost_models"})
 _SHARES: Final = _ONE_IMAGE | {"lost_images", "camera_model_changed"}
 _DIGITS: Final = 1e4
+_NO_DIGITS: Final = 1e12  # larger ones are rounded as they are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +112,7 @@ def _band(key: str, largest: float, margin: float, num_images: int) -> float:
 
 
 def _round_up(value: float) -> float:
-    return math.ceil(value * _DIGITS - 1e-6) / _DIGITS if math.isfinite(value) else value
+    return math.ceil(value * _DIGITS - 1e-6) / _DIGITS if value < _NO_DIGITS else value
 
 
 def _number(value: float) -> str:

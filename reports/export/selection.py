@@ -11,11 +11,12 @@ import csv
 import io
 import json
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sfm_audit.loaders import ModelRef
 from sfm_audit.loaders.datasets.input_state import read_input_state
@@ -97,17 +98,17 @@ def images_of_model(run: RunReader, images: Sequence[AuditedImage], model: Path)
     """
     state = read_input_state(str(model))
     key = ModelRef("", "", "", str(model.resolve()), str(model)).key
-    inputs: list[Mapping[str, Any]] = run.info.get("inputs", [])
-    found = [entry for entry in inputs if entry["part"] == f"part-{key}.parquet"]
-    if found and found[0]["sha256"] != state.digest:
+    inputs = list(run.models())
+    found = [entry for entry in inputs if entry.key == key]
+    if found and found[0].sha256 != state.digest:
         problem = f"holds an audit of {model} from before its files changed"
         raise RunFolderError(run.folder, problem, "run the audit again")
-    found = found or [entry for entry in inputs if entry["sha256"] == state.digest]
+    found = found or [entry for entry in inputs if entry.sha256 == state.digest]
     if len(found) != 1:
         problem = f"holds {len(found) or 'no'} {'audits of copies' if found else 'audit'} of {model}"
-        known = ", ".join(str(entry["model_path"]) for entry in inputs[:3]) + (", ..." if len(inputs) > 3 else "")
+        known = ", ".join(entry.model_path for entry in inputs[:3]) + (", ..." if len(inputs) > 3 else "")
         raise RunFolderError(run.folder, problem, f"name one of its models ({known}), or audit this one first")
-    return tuple(image for image in images if image.model_path == found[0]["model_path"])
+    return tuple(image for image in images if image.model_path == found[0].model_path)
 
 
 def list_text(run: RunReader, images: Sequence[AuditedImage], keep: Keep) -> str:
@@ -116,20 +117,36 @@ def list_text(run: RunReader, images: Sequence[AuditedImage], keep: Keep) -> str
     Raises
     ------
     RunFolderError
-        Two models of the run have the same scene and component, so that lines could not tell them apart.
+        Two models of the run have the same scene and component, or a kept and a removed image of a model the same
+        name, so that lines could not tell them apart.
     """
     path_of: dict[str, str] = {}
     for image in images:
         if path_of.setdefault(image.model, image.model_path) != image.model_path:
             problem = f"holds two models called {image.model}: {path_of[image.model]} and {image.model_path}"
             raise RunFolderError(run.folder, problem, "a list cannot tell them apart; audit them into two folders")
-    is_alone = len(run.info.get("inputs", path_of)) == 1
-    lines = [
-        quoted(image.image_name) if is_alone else f"{quoted(image.model)}\t{quoted(image.image_name)}"
+    _refuse_ambiguous_names(run, images, keep)
+    lines = dict.fromkeys(  # a name that several kept images have stands there once
+        quoted(image.image_name) if run.num_models == 1 else f"{quoted(image.model)}\t{quoted(image.image_name)}"
         for image in images
         if image.is_kept(keep)
-    ]
+    )
     return "".join(f"{line}\n" for line in lines)
+
+
+def _refuse_ambiguous_names(run: RunReader, images: Sequence[AuditedImage], keep: Keep) -> None:
+    """Raise RunFolderError where a kept and a removed image of a model have the same name."""
+    kept = Counter((image.model, image.image_name) for image in images if image.is_kept(keep))
+    gone = Counter((image.model, image.image_name) for image in images if not image.is_kept(keep))
+    both = [name for name in kept if name in gone]
+    if both:
+        model, name = both[0]
+        more = f", and {len(both) - 1} more such names" if len(both) > 1 else ""
+        problem = (
+            f"holds {kept[both[0]] + gone[both[0]]} images called {quoted(name)} in {quoted(model)}, "
+            f"{kept[both[0]]} of them kept and {gone[both[0]]} not{more}; a list of names cannot tell them apart"
+        )
+        raise RunFolderError(run.folder, problem, "use --model and --model-out, which go by image id")
 
 
 def quoted(name: str) -> str:

@@ -22,6 +22,7 @@ from sfm_audit.reports.figures.style import (
 )
 
 _BESIDE: Final[dict[str, Any]] = {"xytext": (3.0, 0.0), "textcoords": "offset points"}
+_TOO_LARGE_PX: Final = 1e100  # nor is NaN below it: axes end at 1e308
 MISFIT_GROUPS: Final = ("radial", "tangential", "affine", "principal_point", "rolling_shutter", "smooth")
 
 
@@ -41,7 +42,7 @@ def misfit_groups(row: Mapping[str, Any], *, tau_px: float | None = None, alpha:
     figure, axes = new_axes(height_in=1.9)
     size = [row[f"misfit_{group}_px"] for group in MISFIT_GROUPS]
     p = [row[f"misfit_{group}_p"] for group in MISFIT_GROUPS]
-    known = [value is not None and np.isfinite(value) for value in size]
+    known = [value is not None and abs(value) < _TOO_LARGE_PX for value in size]
     if not any(known):
         say_nothing_to_show(axes, "no group could be tested")
         return figure
@@ -53,7 +54,7 @@ def misfit_groups(row: Mapping[str, Any], *, tau_px: float | None = None, alpha:
             continue
         sure = p[i] is not None and p[i] < alpha
         axes.barh(i, value, height=0.65, color=BLUE if sure else "none", edgecolor=BLUE, linewidth=0.8)
-        label = f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
+        label = f"{value:.2f}" if 0.1 <= value < 1000 else f"{value:.2g}"
         axes.annotate(label, (value, i), va="center", fontsize=7, color=INK, **_BESIDE)
     if tau_px is not None and np.isfinite(tau_px):
         axes.axvline(tau_px, color=VERMILION, linewidth=1.0, linestyle="--")

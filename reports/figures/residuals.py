@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.run_folder.reader import RunReader
 
 _MAD_OF_NORMAL: Final = 0.6744897501960817
 _XY: Final = ("x_px", "y_px")
@@ -138,28 +139,35 @@ def read_residuals(run: str | Path, image: str, *, scene: str | None = None, com
     """
     wanted = {"scene": scene, "component": component}
     found: list[tuple[str, Mapping[str, Any]]] = []
-    for path in sorted((Path(run) / "images").glob("part-*.parquet")):
-        with pq.ParquetFile(path) as part:
-            rows = part.read(columns=list(_IMAGE_COLUMNS)).to_pylist()
-        by_id = image.removeprefix("id:") if image.startswith("id:") else None
-        named = [row for row in rows if row["image_name"] == image] or [
-            row for row in rows if by_id == str(row["image_id"])
-        ]
-        found += [(path.name, row) for row in named if all(v is None or row[name] == v for name, v in wanted.items())]
-    if len(found) != 1:
-        problem = "no image" if not found else f"{len(found)} images, in different models,"
-        raise ResidualError(f"{run}: {problem} of the name {image!r}; name it as RUN/images has it, and its scene")
-    name, row = found[0]
-    return residuals_of_row(Path(run), name, row)
+    try:
+        reader = RunReader.open(Path(run))
+        for name, rows in reader.parts("images", _IMAGE_COLUMNS):
+            by_id = image.removeprefix("id:") if image.startswith("id:") else None
+            named = [row for row in rows if row["image_name"] == image] or [
+                row for row in rows if by_id == str(row["image_id"])
+            ]
+            found += [(name, row) for row in named if all(v is None or row[k] == v for k, v in wanted.items())]
+        if len(found) != 1:
+            problem = "no image" if not found else f"{len(found)} images"
+            raise ResidualError(f"{run}: {problem} of the name {image!r}; name id:<image_id>, and its scene")
+        return residuals_of_row(reader, *found[0])
+    except RunFolderError as error:
+        raise ResidualError(str(error)) from error
 
 
-def residuals_of_row(run: Path, part: str, row: Mapping[str, Any]) -> Residuals:
-    """Read the residuals of the image in one row of ``RUN/images``, from the part of the same name."""
-    path = run / "observations" / part
-    if not path.exists():
-        raise ResidualError(f"{run}: holds no observations; run again with --observations")
-    columns = [*_XY, *_RESIDUAL, *_Z]
-    table = pq.read_table(path, columns=columns, filters=[("image_id", "==", row["image_id"])])
+def residuals_of_row(run: RunReader, part: str, row: Mapping[str, Any]) -> Residuals:
+    """Read the residuals of the image in one row of ``RUN/images``, from the part of the same name.
+
+    Raises
+    ------
+    ResidualError
+        The run holds none.
+    RunFolderError
+        The part is not what the run wrote.
+    """
+    table = run.rows_of_image("observations", part, row["image_id"], (*_XY, *_RESIDUAL, *_Z))
+    if table is None:
+        raise ResidualError(f"{run.folder}: holds no observations; run again with --observations")
     return residuals_from(table, row)
 
 

@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, Final, ParamSpec
 
+import numpy as np
 from matplotlib import style as mplstyle
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -77,7 +78,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with mplstyle.context(["default", _STYLE]):
+        with mplstyle.context(["default", _STYLE]), np.errstate(all="ignore"):  # numbers near 1e308 leave the axes
             return draw(*args, **kwargs)
 
     return wrapped

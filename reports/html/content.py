@@ -5,12 +5,11 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.words import (
@@ -86,7 +85,7 @@ def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
     columns = [column.name for column in TABLES["images"]]
     chunks: dict[str, list[FloatArray]] = {name: [] for name in DISTRIBUTIONS}
     worst: list[tuple[Any, int, Row]] = []
-    for part, rows in _parts(run, "images", columns):
+    for part, rows in run.parts("images", columns):
         for name, values in chunks.items():
             values.append(np.array([math.nan if row[name] is None else row[name] for row in rows], dtype=np.float64))
         for row in rows:
@@ -134,7 +133,7 @@ def _count(content: RunContent, row: Row) -> None:
 def _read_cameras(content: RunContent) -> None:
     columns = [column.name for column in TABLES["cameras"]]
     worst: list[tuple[Any, int, Row]] = []
-    for _, rows in _parts(content.run, "cameras", columns):
+    for _, rows in content.run.parts("cameras", columns):
         keyed = [(_camera_severity(row), content.num_cameras + i, row) for i, row in enumerate(rows)]
         content.num_cameras += len(rows)
         worst = heapq.nsmallest(MAX_CAMERAS, [*worst, *keyed])
@@ -143,10 +142,3 @@ def _read_cameras(content: RunContent) -> None:
 
 def _camera_severity(row: Row) -> tuple[Any, ...]:
     return (-(row["misfit_px"] or 0.0), -row["num_images"], natural_key(row["scene"], row["camera_id"]))
-
-
-def _parts(run: RunReader, table: str, columns: list[str]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield the name and the rows of each part."""
-    for path in sorted((run.folder / table).glob("part-*.parquet")):
-        with pq.ParquetFile(path) as part:
-            yield path.name, part.read(columns=columns).to_pylist()

@@ -8,6 +8,7 @@ from io import BytesIO, StringIO
 from typing import Final
 
 import matplotlib as mpl
+import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
@@ -42,7 +43,7 @@ def to_svg(figure: Figure, *, key: str, label: str) -> Markup:
     label : what the picture shows, for those who do not see it
     """
     text = StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": key}):
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": key}), np.errstate(all="ignore"):
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
     svg = _REMOVED.sub("", _PREAMBLE.sub("", text.getvalue(), count=1))
     svg = _DIGITS.sub("", _FONTS.sub("sans-serif", _GROUP_ID.sub("", svg)))

@@ -1,36 +1,50 @@
-"""How does a run reach the disk so that a killed one can go on? One Parquet part per model and table, and run.json.
+"""How does a run reach the disk so that a killed one can go on? A Parquet part per model and table, manifest, run.json.
 
-A part is written under a temporary name, flushed to the disk and renamed. The part in ``models`` comes last and is the
-mark that the model is finished: a model without it is audited again. docs/decisions/0002-run-folder.md says which
-commands may write into an existing folder.
+A part is written under a temporary name, flushed to the disk and renamed. A model's line in the manifest holds rows and
+hash of all its parts and is on the disk before the last of them; a model is finished when all its parts are what its
+line says. docs/decisions/0002-run-folder.md says which commands may write into an existing folder, and
+docs/decisions/0008-run-folder-checked.md what is believed of it.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from filelock import FileLock, Timeout
 
 from sfm_audit.loaders.datasets.discover import ModelRef
 from sfm_audit.loaders.datasets.input_state import InputState
 from sfm_audit.loaders.paths.locations import real_location
-from sfm_audit.reports.errors import OutputError, RunFolderError
-from sfm_audit.reports.run_folder.disk import flush_folder, write_whole, writing
+from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
+from sfm_audit.reports.run_folder.disk import append_line, flush_folder, write_whole, writing
+from sfm_audit.reports.run_folder.lock import LOCK, OWNER, LockedError, RunLock
+from sfm_audit.reports.run_folder.manifest import MANIFEST, Manifest, dropped_line, line_of, parsed_or_none, with_hash
+from sfm_audit.reports.run_folder.parts import METADATA_KEY, fits, part_path, part_record
+from sfm_audit.reports.run_folder.record import RUN_JSON, TOOL, ModelRecord, PartRecord, read_run_json
 
-TOOL: Final = "sfm-audit"
 TABLES: Final = ("images", "cameras", "models")  # in the order in which a model's parts are written
-METADATA_KEY: Final = b"sfm_audit"
 COUNTED: Final = ("num_images", "num_accepted", "num_rejected", "num_undetermined")
 OBSERVATIONS: Final = "observations"  # only where it was asked for; written first
+ERRORS: Final = "errors"  # tracebacks of models whose audit was ended by a bug
 _ALL_TABLES: Final = (OBSERVATIONS, *TABLES)
-_OWN_FILES: Final = frozenset({"run.json", ".lock", *_ALL_TABLES})
+_OWN_FILES: Final = frozenset({RUN_JSON, MANIFEST, LOCK, OWNER, ERRORS, *_ALL_TABLES})
+
+
+class RunFailure(NamedTuple):
+    """An input without rows: as in run.json. report: name of the file below RUN that says more."""
+
+    location: str
+    message: str
+    kind: str = "unreadable"
+    report: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,34 +76,19 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """What run.json says about a finished model; all that is kept of it in memory, for a run may have 100,000."""
+    """A finished model; all that is kept of it in memory, for a run may have 100,000.    line: in the manifest."""
 
-    labels: Mapping[str, str]
-    num_bytes: int
-    digest: str
+    line: bytes
     counts: tuple[int, ...]
-    seconds: float
 
     @classmethod
-    def of(cls, part: _Part, ref: ModelRef) -> _Entry:
-        """Keep what is needed of a part."""
-        counts = tuple(part.counts[name] for name in COUNTED)
-        return cls(_labels(ref), part.state.num_bytes, part.state.digest, counts, part.seconds)
-
-    def line(self, key: str) -> bytes:
-        """Return the model's line among the inputs of run.json."""
-        fields = {
-            **self.labels,
-            "part": f"part-{key}.parquet",
-            "num_bytes": self.num_bytes,
-            "sha256": self.digest,
-            "seconds": round(self.seconds, 3),
-        }
-        return json.dumps(fields).encode()
+    def of(cls, line: bytes, counts: Mapping[str, int]) -> _Entry:
+        """Keep what is needed."""
+        return cls(line, tuple(counts[name] for name in COUNTED))
 
 
 class RunStore:
-    """An open run folder; one process at a time.
+    """An open run folder; one process at a time.    reports: of bugs in this run, by model path: name below RUN.
 
     Use as a context manager. Methods raise OutputError when the operating system refuses to write; parts that were
     finished before stay.
@@ -97,10 +96,12 @@ class RunStore:
 
     def __init__(self, folder: Path, settings: RunSettings) -> None:
         self.folder = folder
+        self.reports: dict[str, str] = {}
         self._settings = settings
         self._paths: list[dict[str, str]] = []
+        self._claims: dict[str, bytes] = {}
         self._entries: dict[str, _Entry] = {}
-        self._lock = FileLock(folder / ".lock", timeout=0)
+        self._lock = RunLock(folder)
 
     def __enter__(self) -> Self:
         """Lock the folder and make it ready.
@@ -120,6 +121,7 @@ class RunStore:
         try:
             self._paths = self._bind()
             self._remove_temporary_files()
+            self._read_claims()
             self._write_run_json("running", {})
         except BaseException:
             self._lock.release()
@@ -135,19 +137,20 @@ class RunStore:
     def refuse_to_forget(self, left_out: Iterable[ModelRef]) -> None:
         """Raise RunFolderError where the folder holds one of the models that a command leaves out."""
         for ref in left_out:
-            if self._path("models", ref.key).exists():
+            if part_path(self.folder, "models", ref.key).exists():
                 problem = f"holds {ref.scene}/{ref.component} ({ref.model_path}), which this command leaves out"
                 advice = "choose that one too, choose another -o, or remove the folder"
                 raise RunFolderError(self.folder, problem, advice)
 
     def finished(self, ref: ModelRef) -> InputState | None:
         """Return the input a model was finished with, or None when this run has to audit it."""
-        part = _read_part(self._path("models", ref.key))
-        if part is None or not all(self._path(name, ref.key).exists() for name in self._wanted):
+        found = self._intact(ref.key)
+        if found is None:
             return None
+        line, part = found
         if (part.version, part.config, part.labels) != (self._settings.version, self._config(), _labels(ref)):
             return None
-        self._entries[ref.key] = _Entry.of(part, ref)
+        self._entries[ref.key] = _Entry.of(line, part.counts)
         return part.state
 
     def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
@@ -157,76 +160,142 @@ class RunStore:
         counts = {name: int(row[name][0].as_py()) for name in COUNTED}
         part = _Part(self._settings.version, self._config(), _labels(ref), state, counts, seconds)
         metadata = {METADATA_KEY: json.dumps(asdict(part)).encode()}
+        parts = {}
         for name in self._wanted:
             buffer = pa.BufferOutputStream()
             pq.write_table(tables[name].replace_schema_metadata(metadata), buffer)
-            write_whole(self._path(name, ref.key), [buffer.getvalue()])
-        self._entries[ref.key] = _Entry.of(part, ref)
+            content = buffer.getvalue()
+            parts[name] = part_record(content, tables[name].num_rows)
+            if name == self._wanted[-1]:  # the line is there before the part that makes the model whole
+                line = line_of(_model_record(ref, state, seconds, parts))
+                append_line(self.folder / MANIFEST, line)
+            write_whole(part_path(self.folder, name, ref.key), [content])
+        self._claims[ref.key] = line
+        self._entries[ref.key] = _Entry.of(line, counts)
 
     def drop(self, key: str) -> None:
         """Remove a model's parts, its mark of being finished first."""
-        self._entries.pop(key, None)
-        for name in reversed(_ALL_TABLES):
-            path = self._path(name, key)
+        if self._entries.pop(key, None) or key in self._claims:
+            append_line(self.folder / MANIFEST, dropped_line(key))
+            self._claims.pop(key, None)
+        for path in (*(part_path(self.folder, name, key) for name in reversed(_ALL_TABLES)), self._report(key)):
             with writing(path):
-                if path.exists():
+                if os.path.lexists(path):
                     path.unlink()
                     flush_folder(path.parent)  # no later part may reach the disk before the mark is gone from it
 
-    def finish(self, keep: Iterable[str] | None, failures: Sequence[tuple[str, str]], seconds: float) -> None:
-        """Complete run.json, after removing all models but those in ``keep`` (None: remove nothing).
+    def keep_report(self, ref: ModelRef, text: str) -> None:
+        """Write what a bug left behind for a model that has no rows."""
+        path = self._report(ref.key)
+        with writing(path):
+            path.parent.mkdir(exist_ok=True)
+        write_whole(path, [text.encode(errors="backslashreplace")])
+        self.reports[ref.model_path] = f"{ERRORS}/{path.name}"
 
-        failures: (model path or PATH, message).    seconds: how long the run took.
+    def finish(self, keep: Iterable[str] | None, failures: Iterable[RunFailure], seconds: float) -> None:
+        """Complete manifest and run.json, after removing all models but those in ``keep``.
+
+        keep: None: all that are intact.    seconds: how long the run took.
         """
-        if keep is not None:
-            wanted = set(keep)
-            for path in sorted((self.folder / "models").glob("part-*.parquet")):
-                key = path.stem.removeprefix("part-")
-                if key not in wanted:
-                    self.drop(key)
-        entries = self._entries
+        failures = [RunFailure(*failure) for failure in failures]
+        if keep is None:
+            for key in self._claims.keys() - self._entries.keys():
+                found = self._intact(key)
+                if found is not None:
+                    self._entries[key] = _Entry.of(found[0], found[1].counts)
+        kept = self._entries.keys() if keep is None else self._entries.keys() & set(keep)
+        self._remove_strangers(set(kept), {report for *_, report in failures if report})
+        entries = {key: entry for key, entry in sorted(self._entries.items()) if key in kept}
         totals = {name: sum(entry.counts[i] for entry in entries.values()) for i, name in enumerate(COUNTED)}
+        pieces, manifest = with_hash(entry.line for entry in entries.values())
+        write_whole(self.folder / MANIFEST, pieces)
         content = {
             "counts": {"num_models": len(entries), **totals, "num_failures": len(failures)},
-            "failures": [{"location": location, "message": message} for location, message in failures],
+            "manifest": manifest.model_dump(),
+            "failures": [failure._asdict() for failure in failures],
             "seconds": round(seconds, 3),
         }
-        order = sorted(entries, key=lambda key: entries[key].labels["model_path"])
-        self._write_run_json("complete", content, (entries[key].line(key) for key in order))
+        self._write_run_json("complete", content)
 
     @property
     def _wanted(self) -> tuple[str, ...]:
         """The tables of a finished model, in the order in which they are written."""
         return _ALL_TABLES if self._settings.observations else TABLES
 
-    def _path(self, table: str, key: str) -> Path:
-        return self.folder / table / f"part-{key}.parquet"
+    def _report(self, key: str) -> Path:
+        return self.folder / ERRORS / f"{key}.txt"
 
     def _acquire(self) -> None:
         try:
             self._lock.acquire()
-        except Timeout:  # an OSError too, so it stands first
-            raise RunFolderError(self.folder, "another run is writing here", "wait, or choose another -o") from None
+        except LockedError as error:
+            problem = f"another run is writing here ({error})"
+            raise RunFolderError(self.folder, problem, "wait, or choose another -o") from None
         except OSError as error:
             raise OutputError(self.folder, error.strerror or str(error)) from error
+
+    def _read_claims(self) -> None:
+        """Keep the lines of the manifest that is there, and nothing of what else stands in it."""
+        try:
+            self._claims = Manifest.read(self.folder, None).by_key()
+        except DamagedRunError:  # no file at all: what has no line is audited again
+            self._claims = {}
+        write_whole(self.folder / MANIFEST, (line + b"\n" for line in self._claims.values()))
+
+    def _intact(self, key: str) -> tuple[bytes, _Part] | None:
+        """Return a model's line and what its parts say, None unless all parts are there as they were written."""
+        line = self._claims.get(key, b"")
+        model = parsed_or_none(line)
+        if model is None or model.key != key or not model.parts.keys() >= set(self._wanted):
+            return None
+        if not all(fits(part_path(self.folder, name, key), part) for name, part in model.parts.items()):
+            return None
+        said = _read_part(part_path(self.folder, "models", key))
+        if said is None or (said.labels, said.state.digest, said.state.num_bytes) != (
+            model.labels,
+            model.sha256,
+            model.num_bytes,
+        ):
+            return None
+        return line, said
+
+    def _remove_strangers(self, kept: AbstractSet[str], reports: AbstractSet[str]) -> None:
+        """Remove parts of models that are not kept, and reports of failures that are none any more."""
+        wanted = {f"part-{key}.parquet" for key in kept}
+        for name in _ALL_TABLES:
+            for path in sorted((self.folder / name).glob("part-*.parquet")):
+                if path.name not in wanted:
+                    with writing(path):
+                        path.unlink()
+        for path in sorted((self.folder / ERRORS).glob("*.txt")):
+            if f"{ERRORS}/{path.name}" not in reports:
+                with writing(path):
+                    path.unlink()
 
     def _config(self) -> dict[str, Any]:
         return dict(self._settings.config)
 
     def _bind(self) -> list[dict[str, str]]:
         """Refuse a folder that holds another run; return the PATHs that it is bound to from now on."""
-        old = _read_run_json(self.folder) or {"config": self._config(), "paths": []}
-        mine = self._config()
-        for name in sorted({*old["config"], *mine}):
-            if old["config"].get(name) != mine.get(name):
-                problem = f"holds a run with {name} = {old['config'].get(name)}, not {mine.get(name)}"
+        try:
+            old = read_run_json(self.folder)
+        except FileNotFoundError:
+            return self._named(set())
+        mine, theirs = self._config(), old.config.model_dump()
+        for name in sorted({*theirs, *mine}):
+            if theirs.get(name) != mine.get(name):
+                problem = f"holds a run with {name} = {theirs.get(name)}, not {mine.get(name)}"
                 raise RunFolderError(self.folder, problem, "choose another -o, or remove the folder")
-        named = {real_location(path): path for path in self._settings.paths}
-        bound = {path["real"]: path["given"] for path in old["paths"]}
-        lost = [given for real, given in bound.items() if real not in named]
+        named = {real_location(path) for path in self._settings.paths}
+        lost = [path.given for path in old.paths if path.real not in named]
         if lost:
             problem = f"holds a run over {lost[0]}, which this command leaves out"
             raise RunFolderError(self.folder, problem, "name that PATH too, choose another -o, or remove the folder")
+        return self._named({path.real for path in old.paths})
+
+    def _named(self, bound: AbstractSet[str]) -> list[dict[str, str]]:
+        """Return the PATHs of the command; one without models only where the folder was bound to it before."""
+        named = {real_location(path): path for path in self._settings.paths}
         return [
             {"given": given, "real": real}
             for real, given in named.items()
@@ -239,12 +308,12 @@ class RunStore:
                 for path in folder.glob(".tmp-*"):
                     path.unlink()
 
-    def _write_run_json(self, status: str, content: Mapping[str, Any], inputs: Iterable[bytes] | None = None) -> None:
+    def _write_run_json(self, status: str, content: Mapping[str, Any]) -> None:
         settings = self._settings
         head = {"tool": TOOL, "version": settings.version, "status": status}
         bound = {"config": self._config(), "paths": self._paths}
         text = json.dumps({**head, **bound, **content}, indent=1)
-        write_whole(self.folder / "run.json", _with_inputs(text.encode(), inputs))
+        write_whole(self.folder / RUN_JSON, [text.encode()])
 
 
 def _labels(ref: ModelRef) -> dict[str, str]:
@@ -252,7 +321,14 @@ def _labels(ref: ModelRef) -> dict[str, str]:
 
 
 def _refuse_foreign_folder(folder: Path) -> None:
-    if not folder.is_dir() or (folder / "run.json").exists():
+    if not folder.is_dir():
+        return
+    for name in (*_ALL_TABLES, ERRORS):
+        if (folder / name).is_symlink():
+            raise RunFolderError(
+                folder, f"its {name} is a link, and parts are written into no other place", "remove it"
+            )
+    if (folder / RUN_JSON).exists():
         return
     with writing(folder):
         names = sorted(path.name for path in folder.iterdir())
@@ -262,17 +338,15 @@ def _refuse_foreign_folder(folder: Path) -> None:
         raise RunFolderError(folder, problem, "choose a new folder with -o")
 
 
-def _read_run_json(folder: Path) -> dict[str, Any] | None:
-    path = folder / "run.json"
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except ValueError:
-        content = None
-    if not isinstance(content, dict) or content.get("tool") != TOOL or not {"config", "paths"} <= content.keys():
-        raise RunFolderError(folder, "its run.json was not written by sfm-audit", "choose a new folder with -o")
-    return content
+def _model_record(ref: ModelRef, state: InputState, seconds: float, parts: Mapping[str, PartRecord]) -> ModelRecord:
+    return ModelRecord(
+        key=ref.key,
+        **_labels(ref),
+        num_bytes=state.num_bytes,
+        sha256=state.digest,
+        seconds=round(seconds, 3),
+        parts=dict(parts),
+    )
 
 
 def _read_part(path: Path) -> _Part | None:
@@ -283,16 +357,3 @@ def _read_part(path: Path) -> _Part | None:
         return _Part(**{**fields, "state": InputState(**fields["state"])})
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _with_inputs(text: bytes, inputs: Iterable[bytes] | None) -> Iterator[bytes]:
-    """Yield a JSON object, and before its last brace the member ``inputs``, an element per line."""
-    if inputs is None:
-        yield text
-        return
-    yield text.removesuffix(b"\n}") + b',\n "inputs": ['
-    separator = b"\n  "
-    for line in inputs:
-        yield separator + line
-        separator = b",\n  "
-    yield b"\n ]\n}"

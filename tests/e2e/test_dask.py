@@ -74,7 +74,7 @@ def test_a_cluster_that_was_started_elsewhere(data):
 @pytest.mark.usefixtures("data")
 def test_a_model_that_kills_its_worker_is_a_failure_and_the_others_are_not():
     code, _, err = run_cli("run", "data", "-o", "RUN", "--jobs", "2", "--dask", "local", "--quiet", stub="die")
-    assert code == 3
+    assert code == 5
     assert err.count("\n") == 1
     assert "deadly/sparse/0: the process that audited it died twice" in err
     assert len(list(Path("RUN/models").iterdir())) == 2

@@ -91,6 +91,37 @@ def test_the_command_is_killed_at_a_random_moment(expected, seed, schedule):
     assert {name: after[name] for name in finished} == {name: before[name] for name in finished}
 
 
+@pytest.mark.parametrize(
+    "schedule", [("--jobs", "1"), ("--jobs", "2"), ("--jobs", "2", "--dask", "local")], ids=" ".join
+)
+@pytest.mark.parametrize("seed", range(KILLS))
+@pytest.mark.usefixtures("data")
+def test_parts_are_damaged_after_the_command_was_killed(expected, seed, schedule):
+    """And once more while it is whole: what is intact stays, what is not is made again."""
+    if "--dask" in schedule:
+        pytest.importorskip("distributed")
+    rng = random.Random(1000 + seed)  # noqa: S311
+    with start_cli("run", "data", "-o", "RUN", *schedule, stub="slow") as process:
+        wait_for(lambda: len(list(Path("RUN").glob("models/part-*.parquet"))) >= 2)
+        below = descendants(process.pid)
+        process.kill()
+        process.communicate()
+        wait_for(lambda: not any(is_worker(pid) for pid in below), 30)
+    for _ in range(2):
+        before = part_times(Path("RUN"))
+        victim = rng.choice(sorted(before))
+        content = Path("RUN", victim).read_bytes()
+        other = Path("RUN", rng.choice([name for name in sorted(before) if name != victim]))
+        Path("RUN", victim).write_bytes(rng.choice([b"", content[:-1], bytes(len(content)), other.read_bytes()]))
+        assert main(["run", "data", "-o", "RUN", "--jobs", "1", "--quiet"]) == 0
+        check(Path("RUN"), expected)
+        key = Path(victim).name
+        after = part_times(Path("RUN"))
+        finished = {Path(name).name for name in before if name.startswith("models")} - {key}
+        assert all(after[name] == time for name, time in before.items() if Path(name).name in finished)
+        assert after[victim] != before[victim]
+
+
 @pytest.mark.parametrize("schedule", [("--jobs", "2"), ("--jobs", "2", "--dask", "local")], ids=" ".join)
 @pytest.mark.parametrize("seed", range((KILLS + 1) // 2))
 @pytest.mark.usefixtures("data")

@@ -115,7 +115,7 @@ def test_a_run_has_the_rows_of_a_local_one(server, bucket, source, jobs, capsys)
         keys = [("scene", "ascending"), *([("image_id", "ascending")] if name == "images" else [])]
         columns = [column for column in local[name].column_names if column != "model_path"]
         assert remote[name].select(columns).sort_by(keys).equals(local[name].select(columns).sort_by(keys))
-    inputs = json.loads(Path("REMOTE/run.json").read_text(encoding="utf-8"))["inputs"]
+    inputs = [json.loads(line) for line in Path("REMOTE/manifest.jsonl").read_text(encoding="utf-8").splitlines()]
     assert all(entry["model_path"].startswith("s3://") for entry in inputs)
 
 

@@ -1,4 +1,5 @@
 import statistics
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,15 +91,9 @@ def test_images_are_found_again_by_name_in_other_components_and_order():
 def test_the_order_of_parts_does_not_matter():
     scenes = {f"{i}": rejected(scene(6), i) for i in range(4)}
     run = write_run(Path("R"), scenes)
-    expected = RunSnapshot.read(run)
-    for table in ("images", "models", "cameras"):
-        parts = sorted(Path("R", table).glob("part-*.parquet"))
-        new_names = [f"part-{i:016x}.parquet" for i in range(len(parts))]
-        for part, name in zip(parts, new_names[::-1], strict=True):
-            part.rename(part.with_name(name))
-    assert RunSnapshot.read(run) != expected  # other objects
-    assert dict(RunSnapshot.read(run).images) == dict(expected.images)
-    assert not any(change.anything for change in compare(expected, RunSnapshot.read(run)).changes)
+    backwards = replace(run, contents=replace(run.contents, lines=run.contents.lines[::-1]))
+    assert dict(RunSnapshot.read(backwards).images) == dict(RunSnapshot.read(run).images)
+    assert not any(change.anything for change in compare(RunSnapshot.read(run), RunSnapshot.read(backwards)).changes)
 
 
 def test_every_kind_of_change_is_listed():

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import audit_stubs
@@ -6,7 +7,8 @@ import threadpoolctl
 from run_samples import write_models
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.schedule.runner import Failure, audit_many, audit_one
+from sfm_audit.audit.schedule import task as task_module
+from sfm_audit.audit.schedule.runner import Failure, Limits, audit_many, audit_one
 from sfm_audit.loaders import discover
 from sfm_audit.loaders.datasets.input_state import InputState, input_stamp, read_input_state
 
@@ -18,6 +20,7 @@ class Memory:
         self.states: dict[str, InputState] = {}
         self.tables = {}
         self.dropped = []
+        self.reports = {}
 
     def finished(self, ref):
         return self.states.get(ref.key)
@@ -29,6 +32,9 @@ class Memory:
 
     def drop(self, key):
         self.dropped.append(key)
+
+    def keep_report(self, ref, text):
+        self.reports[ref.key] = text
 
 
 @pytest.fixture
@@ -89,19 +95,87 @@ def test_a_model_whose_process_dies_once_is_tried_again(refs):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_nobody_expects_is_raised(refs, jobs):
-    with pytest.raises(ZeroDivisionError, match="a bug"):
-        audit_many(refs, AuditConfig(), jobs=jobs, sink=Memory(), audit=audit_stubs.break_down)
+@pytest.mark.parametrize(
+    ("audit", "kind", "said"),
+    [
+        (audit_stubs.break_down, "error", "a bug ended its audit (ZeroDivisionError: a bug)"),
+        (audit_stubs.run_out_of_memory, "memory", "memory was too short to audit it (MemoryError)"),
+        (audit_stubs.recurse, "error", "a bug ended its audit (RecursionError: maximum recursion depth exceeded"),
+    ],
+)
+def test_an_error_nobody_expects_costs_its_model_alone(refs, jobs, audit, kind, said):
+    sink = Memory()
+    told = []
+    (failure,) = audit_many(refs, AuditConfig(), jobs=jobs, sink=sink, audit=audit, on_failure=told.append)
+    assert told == [failure]
+    assert (failure.location, failure.kind) == (refs[1].model_path, kind)
+    assert failure.message.startswith(f"{refs[1].model_path}: {said}")
+    assert "\n" not in failure.message
+    assert len(sink.tables) == 3
+    (report,) = sink.reports.values()
+    for words in ("Traceback", f"in {audit.__name__}", "sfm-audit 0.", "pycolmap ", refs[1].model_path, '"alpha":0.05'):
+        assert words in report
+    assert report.count("\n") < 200
 
 
-def test_a_bug_says_which_model_it_met(refs, monkeypatch):
-    def broken(*_: object, **__: object):
-        raise ZeroDivisionError("a bug")
+def test_a_model_that_memory_is_too_short_to_read_is_an_input_that_cannot_be_read(refs, monkeypatch):
+    read = task_module.open_model
 
-    monkeypatch.setattr("sfm_audit.audit.schedule.task.audit_model", broken)
-    with pytest.raises(ZeroDivisionError) as caught:
-        run(refs, Memory())
-    assert caught.value.__notes__ == [f"while auditing {refs[0].model_path}"]
+    def open_model(location: str):
+        if "broken" in location:
+            raise MemoryError
+        return read(location)
+
+    monkeypatch.setattr(task_module, "open_model", open_model)
+    (failure,) = run(refs, Memory())
+    assert (failure.location, failure.kind, failure.report) == (refs[1].model_path, "too_large", None)
+    assert "memory was too short to read its " in failure.message
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_what_asks_for_the_end_is_no_model_s_failure(refs, error):
+    def end(_: object):
+        raise error
+
+    with pytest.raises(error):
+        audit_many(refs, AuditConfig(), jobs=1, sink=Memory(), audit=end)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_model_that_takes_too_long_is_ended_and_the_others_are_not(refs, jobs):
+    sink = Memory()
+    limits = Limits(seconds=8.0)
+    (failure,) = audit_many(refs, AuditConfig(), jobs=jobs, sink=sink, audit=audit_stubs.sleep, limits=limits)
+    assert (failure.location, failure.kind) == (refs[1].model_path, "time")
+    assert "its audit was ended at 8" in failure.message
+    assert "(--max-model-seconds); raise the limit, or leave it out" in failure.message
+    assert len(sink.tables) == 3
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_model_that_takes_too_much_memory_is_ended_and_the_others_are_not(refs, jobs):
+    sink = Memory()
+    limits = Limits(memory_bytes=700_000_000)
+    (failure,) = audit_many(refs, AuditConfig(), jobs=jobs, sink=sink, audit=audit_stubs.fill_memory, limits=limits)
+    assert (failure.location, failure.kind) == (refs[1].model_path, "memory")
+    assert "GB of memory (--max-model-memory)" in failure.message
+    assert len(sink.tables) == 3
+
+
+def test_verify_reads_what_sizes_and_times_hide(refs):
+    sink = Memory()
+    run(refs, sink)
+    before = dict(sink.tables)
+    file = Path(refs[0].location, "points3D.bin")
+    stat = file.stat()
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    run(refs, sink)
+    assert all(sink.tables[key] is tables for key, tables in before.items())
+    audit_many(refs, AuditConfig(), jobs=1, sink=sink, verify=True)
+    assert [key for key, tables in before.items() if sink.tables[key] is not tables] == [refs[0].key]
 
 
 def test_touched_files_are_compared_by_content(refs):

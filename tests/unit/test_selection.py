@@ -82,6 +82,25 @@ def test_models_that_a_list_cannot_tell_apart_are_refused(tmp_path):
         list_text(run, read_images(run), Keep.NOT_REJECTED)
 
 
+def test_a_name_that_a_kept_and_a_removed_image_share_is_refused(tmp_path):
+    names = ("same.jpg", "x.jpg", "same.jpg", "same.jpg")
+    run = write_run(tmp_path / "RUN", model(names=names, verdicts=("accepted", "accepted", "rejected", "undetermined")))
+    words = (
+        r"3 images called same\.jpg in a/0, 2 of them kept and 1 not; a list of names cannot tell them apart; use --"
+    )
+    with pytest.raises(RunFolderError, match=words):
+        lines(run)
+    with pytest.raises(RunFolderError, match="1 of them kept and 2 not"):
+        lines(run, Keep.ACCEPTED)
+
+
+def test_a_name_that_only_kept_images_share_stands_there_once(tmp_path):
+    names = ("same.jpg", "x.jpg", "same.jpg", "y.jpg")
+    one = model(names=names, verdicts=("accepted", "rejected", "undetermined", "accepted"))
+    run = write_run(tmp_path / "RUN", one, model("b", names=("same.jpg", "z.jpg"), verdicts=("rejected", "accepted")))
+    assert sorted(lines(run)) == ["a/0\tsame.jpg", "a/0\ty.jpg", "b/0\tz.jpg"]
+
+
 def test_every_name_is_one_line_and_comes_back(tmp_path):
     run = write_run(tmp_path / "RUN", model(scene="s\t1\n", names=NAMES, verdicts=["accepted"] * len(NAMES)), model())
     text = list_text(run, read_images(run), Keep.NOT_REJECTED)

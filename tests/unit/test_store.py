@@ -1,6 +1,8 @@
 import errno
+import hashlib
 import json
 import os
+import subprocess
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +35,10 @@ def run_json(folder: Path) -> dict:
     return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
+def manifest(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "manifest.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
 def test_a_run_folder_holds_what_design_says(tmp_path):
     run = tmp_path / "new" / "RUN"
     write_run(run)
@@ -49,10 +55,22 @@ def test_a_run_folder_holds_what_design_says(tmp_path):
         "num_undetermined": 0,
         "num_failures": 0,
     }
-    assert [(item["model_path"], item["num_bytes"], item["sha256"]) for item in info["inputs"]] == [
-        (A.model_path, 1000, "digest"),
-        (B.model_path, 1000, "digest"),
-    ]
+    inputs = {item["key"]: (item["model_path"], item["num_bytes"], item["sha256"]) for item in manifest(run)}
+    assert inputs == {A.key: (A.model_path, 1000, "digest"), B.key: (B.model_path, 1000, "digest")}
+
+
+def test_rows_and_hash_of_every_part_stand_in_the_manifest_and_its_hash_in_run_json(tmp_path):
+    write_run(tmp_path)
+    content = (tmp_path / "manifest.jsonl").read_bytes()
+    assert run_json(tmp_path)["manifest"] == {"num_models": 2, "sha256": hashlib.sha256(content).hexdigest()}
+    assert [item["key"] for item in manifest(tmp_path)] == sorted([A.key, B.key])
+    for item in manifest(tmp_path):
+        assert item["parts"].keys() == {"images", "cameras", "models"}
+        for table, part in item["parts"].items():
+            file = tmp_path / table / f"part-{item['key']}.parquet"
+            known = subprocess.run(["sha256sum", file], capture_output=True, text=True, check=True).stdout[:64]
+            rows = pa.parquet.ParquetFile(file).metadata.num_rows
+            assert part == {"rows": rows, "num_bytes": file.stat().st_size, "sha256": known}
 
 
 def test_pandas_reads_all_parts_of_a_table_at_once(tmp_path):
@@ -248,15 +266,14 @@ def test_the_metadata_of_a_part_does_not_change_its_rows(tmp_path):
     assert read.equals(tables["images"])
 
 
-def test_run_json_is_written_input_by_input_and_is_what_json_would_make_of_it(tmp_path):
-    refs = [make_ref(f'data/ä{i}"/sparse/0', scene=f'ä{i}"') for i in range(3)]
+def test_any_name_stays_on_its_line_of_the_manifest(tmp_path):
+    refs = [make_ref(f'data/ä\n{i}"\u2028/sparse/0', scene=f'ä{i}"\r') for i in range(3)]
     write_run(tmp_path, refs)
-    text = (tmp_path / "run.json").read_text(encoding="utf-8")
-    info = json.loads(text)
-    assert [item["scene"] for item in info["inputs"]] == [ref.scene for ref in refs]
-    assert sum('"model_path"' in line for line in text.splitlines()) == 3
+    assert sorted(item["scene"] for item in manifest(tmp_path)) == [ref.scene for ref in refs]
+    assert sorted(row["scene"] for row in RunReader.open(tmp_path).rows("models", ["scene"])) == [r.scene for r in refs]
     write_run(tmp_path / "empty", [])
-    assert run_json(tmp_path / "empty")["inputs"] == []
+    assert manifest(tmp_path / "empty") == []
+    assert list(RunReader.open(tmp_path / "empty").rows("images", ["scene"])) == []
 
 
 def test_what_is_kept_of_a_finished_model_is_small(tmp_path):

@@ -299,7 +299,7 @@ class Repeated(RunReader):
 
 def test_memory_does_not_grow_with_the_number_of_models(run_folder):
     run = make_run(run_folder, 2, 3)
-    many = Repeated(run.folder, run.info)
+    many = Repeated(run.folder, run.info, run.contents)
     peaks = []
     for times in (200, 1200):
         Repeated.times = times
