@@ -38,6 +38,7 @@ from sfm_audit.loaders.paths.text_lines import (
     POINTS,
     TextFile,
     check_count,
+    check_text,
     parse_floats,
     parse_uint,
     read_text,
@@ -79,6 +80,12 @@ def read_model(folder: InputPath) -> RawModel:
         *frame_findings,
     )
     return RawModel(cameras, images, points, rigs, frames, findings)
+
+
+def check_structure(folder: InputPath) -> None:
+    """Raise LoadError where a file of the model holds a NUL byte, as one that was grown by zeros does."""
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        check_text(folder / name)
 
 
 def read_cameras(file: TextFile) -> CameraTable:
