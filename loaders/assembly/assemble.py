@@ -26,7 +26,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xyz_world=raw.points.xyz_world[order],
         stored_error_px=raw.points.stored_error_px[order],
     )
-    poses, rig_findings = compose_poses(raw.images, raw.rigs, raw.frames)
+    poses, rig_findings = compose_poses(raw)
     images = ImageTable(
         image_id=raw.images.image_id,
         name=raw.images.name,

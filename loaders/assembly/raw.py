@@ -71,12 +71,13 @@ class RawRig:
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """One frame: where its rig was, and the images it consists of."""
+    """One frame: where its rig was, the images it consists of, and the camera that it names for each of them."""
 
     frame_id: int
     rig_id: int
     rig_from_world: Pose
     image_ids: tuple[int, ...]
+    sensor_ids: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -222,5 +222,6 @@ def _read_frame(cursor: Cursor) -> tuple[int, RawFrame]:
     kind = f"data of frame {frame_id}"
     check_count(cursor.path, cursor.offset - 4, (num_data, kind), _FRAME_DATA.size, cursor.num_left)
     data = [cursor.unpack(_FRAME_DATA, f"the data of frame {frame_id}") for _ in range(num_data)]
-    images = tuple(data_id for kind, _, data_id in data if kind == CAMERA_SENSOR)
-    return frame_id, RawFrame(frame_id, rig_id, tuple(pose), images)
+    seen = [(data_id, sensor_id) for kind, sensor_id, data_id in data if kind == CAMERA_SENSOR]
+    image_ids, sensor_ids = tuple(each[0] for each in seen), tuple(each[1] for each in seen)
+    return frame_id, RawFrame(frame_id, rig_id, tuple(pose), image_ids, sensor_ids)

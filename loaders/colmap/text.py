@@ -259,7 +259,8 @@ def _read_frame(fields: _Fields) -> RawFrame:
     pose = fields.pose("rig_from_world")
     data = [(fields.sensor(), fields.uint("a data id", 64)) for _ in range(fields.uint("a number of data"))]
     fields.finish()
-    return RawFrame(frame_id, rig_id, pose, tuple(data_id for (kind, _), data_id in data if kind == CAMERA_SENSOR))
+    seen = [(data_id, sensor_id) for (kind, sensor_id), data_id in data if kind == CAMERA_SENSOR]
+    return RawFrame(frame_id, rig_id, pose, tuple(each[0] for each in seen), tuple(each[1] for each in seen))
 
 
 def _uneven(fields: list[bytes], size: int) -> str:
