@@ -21,7 +21,7 @@ _MAX_HASH: Final = 1000  # steps, and levels, of one key
 _MAX_LINE: Final = 4096  # bytes of a number or a name in the text opcodes
 _MAX_INTEGER: Final = 64  # bytes
 _MAX_KEY: Final = 9  # bytes of an integer as a key; of longer ones, any number can be chosen to collide
-_OBJECT_BYTES: Final = (16 << 20, 24)  # of all objects: this much, and so many times the file
+_OBJECT_BYTES: Final = (16 << 20, 16)  # of all objects: this much, and so many times the file
 _HASHES: Final = (100_000, 16)
 
 _SIZES: Final = {  # bytes of an object by opcode, CPython 3.11, 64 bit; what it holds is in the file
