@@ -50,6 +50,14 @@ def listing_of(folder: RemotePath) -> Mapping[str, Entry]:
     return folder.listings[0]
 
 
+def names_in(folder: InputPath) -> tuple[str, ...]:
+    """Return the names in a folder; none where it cannot be listed."""
+    try:
+        return tuple(listing_of(folder) if isinstance(folder, RemotePath) else os.listdir(folder))
+    except (OSError, LoadError):
+        return ()
+
+
 def is_folder(path: InputPath) -> bool:
     """Whether ``path`` is a folder; LoadError where an object store does not answer."""
     if isinstance(path, Path):
