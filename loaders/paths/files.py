@@ -53,7 +53,9 @@ def listing_of(folder: RemotePath) -> Mapping[str, Entry]:
 def names_in(folder: InputPath) -> tuple[str, ...]:
     """Return the names in a folder; none where it cannot be listed."""
     try:
-        return tuple(listing_of(folder) if isinstance(folder, RemotePath) else os.listdir(folder))
+        if isinstance(folder, RemotePath):
+            return tuple(listing_of(folder))
+        return tuple(path.name for path in folder.iterdir())
     except (OSError, LoadError):
         return ()
 
