@@ -31,6 +31,7 @@ from scripts.fuzzing.cases import Case, write_case
 from scripts.fuzzing.targets import TARGETS, Outcome
 from scripts.fuzzing.workers import Worker
 
+_PYCOLMAP_SECONDS = 5.0  # where it takes longer, it hangs
 _MAX_SAME = 3  # failures at one place that are made small and written
 
 
@@ -95,7 +96,7 @@ def _work(
     options: argparse.Namespace, targets: Sequence[str], numbers: Iterator[int], campaign: Campaign, end: float
 ) -> None:
     limits = {"memory_bytes": options.memory_mb << 20, "seconds": options.seconds}
-    worker, theirs = Worker(**limits), Worker(**limits, with_pycolmap=True)
+    worker, theirs = Worker(**limits), Worker(**{**limits, "seconds": _PYCOLMAP_SECONDS}, with_pycolmap=True)
     try:
         while time.monotonic() < end or options.only is not None:
             with campaign.lock:

@@ -230,5 +230,7 @@ def _rig_line(r: Rig) -> str:
 
 
 def _frame_line(f: Frame) -> str:
-    data = [value for kind, sensor_id, data_id in f.data for value in (SENSOR_NAMES.get(kind, kind), sensor_id, data_id)]
+    data = [
+        value for kind, sensor_id, data_id in f.data for value in (SENSOR_NAMES.get(kind, kind), sensor_id, data_id)
+    ]
     return _join(f.frame_id, f.rig_id, *f.pose, len(f.data), *data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm_audit.loaders.assembly.consistency import find_inconsistencies
+from sfm_audit.loaders.assembly.extremes import unused_nonfinite
 from sfm_audit.loaders.assembly.lookup import rows_of
 from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.assembly.rigs import compose_poses
@@ -42,7 +43,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xy_px=raw.images.xy_px,
         point_idx=rows_of(points.point3d_id, raw.images.point3d_id),
     )
-    known = raw.findings + rig_findings
+    known = raw.findings + rig_findings + unused_nonfinite(raw, poses)
     model = SparseModel(location, file_format, raw.cameras, images, points, observations, known)
     return SparseModel(
         location,

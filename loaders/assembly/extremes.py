@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.camera_models import BY_ID
 from sfm_audit.loaders.model import CameraTable, Finding, FindingCode, SparseModel
 
@@ -77,6 +78,24 @@ def extreme_values(model: SparseModel) -> Finding | None:
         return None
     text = f"numbers above {MAX_MAGNITUDE:g} in {', '.join(what for _, what in found)}"
     return Finding(FindingCode.EXTREME_VALUES, sum(count for count, _ in found), text)
+
+
+def unused_nonfinite(raw: RawModel, poses: FloatArray) -> tuple[Finding, ...]:
+    """Numbers that are not finite where nothing is read from: COLMAP refuses a text file with them.
+
+    poses : (I, 7) of the images, which rigs and frames may have replaced
+    """
+    is_replaced = ~np.isfinite(raw.images.poses).all(axis=1) & np.isfinite(poses).all(axis=1)
+    counts = {
+        "unlinked 2D points": raw.images.num_unused_nonfinite,
+        "colours of 3D points": raw.points.num_unused_nonfinite,
+        "poses that rigs and frames replace": int(np.count_nonzero(is_replaced)),
+    }
+    parts = [f"{count} {what}" for what, count in counts.items() if count]
+    if not parts:
+        return ()
+    text = f"{', '.join(parts)} are not finite; they are not used here"
+    return (Finding(FindingCode.NON_FINITE_UNUSED, sum(counts.values()), text),)
 
 
 def _extreme(rows: FloatArray) -> BoolArray:

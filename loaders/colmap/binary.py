@@ -178,7 +178,11 @@ def _read_name(file: BufferedReader, path: InputPath, start: int, image_id: int)
 
 
 def check_structure(folder: InputPath) -> None:
-    """Raise LoadError where the records of images.bin or points3D.bin do not fill their files; keeps nothing."""
+    """Raise LoadError where the records of a model's files do not fill them; keeps nothing of the large ones."""
+    read_cameras(folder / "cameras.bin")
+    for name, read in (("rigs.bin", read_rigs), ("frames.bin", read_frames)):
+        if exists(folder / name):
+            read(folder / name)
     path = folder / "images.bin"
     file, size = open_input(path)
     with file, reading(path):

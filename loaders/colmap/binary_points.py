@@ -22,6 +22,7 @@ _POINT3D: Final = np.dtype(
 )
 _TRACK_LENGTH_AT: Final = 43
 _PIECE_BYTES: Final = 1 << 25  # in memory at a time
+_FIRST_BYTES: Final = 1 << 16  # of the first piece, in which most damage shows
 
 
 def read_points(path: InputPath) -> RawPoints:
@@ -81,9 +82,10 @@ def point_pieces(path: InputPath) -> Iterator[_Piece]:
             raise truncated(path, 0, "the number of 3D points", COUNT.size, len(head))
         (count,) = COUNT.unpack(head)
         check_count(path, 0, (count, "3D points"), _POINT3D.itemsize, size - COUNT.size)
-        at, row, data, num_wanted = COUNT.size, 0, b"", 0
+        at, row, data, num_wanted, piece_bytes = COUNT.size, 0, b"", 0, min(_FIRST_BYTES, _PIECE_BYTES)
         while row < count:
-            data += file.read(max(_PIECE_BYTES, num_wanted))
+            data += file.read(max(piece_bytes, num_wanted))
+            piece_bytes = _PIECE_BYTES
             starts, end = _point_starts(data, count - row)
             if starts:
                 piece = _Piece(data, at, np.array(starts, dtype=np.int64))

@@ -84,8 +84,9 @@ def read_model(folder: InputPath) -> RawModel:
 
 def check_structure(folder: InputPath) -> None:
     """Raise LoadError where a file of the model holds a NUL byte, as one that was grown by zeros does."""
-    for name in ("cameras.txt", "images.txt", "points3D.txt"):
-        check_text(folder / name)
+    for name in ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"):
+        if exists(folder / name):
+            check_text(folder / name)
 
 
 def read_cameras(file: TextFile) -> CameraTable:
@@ -160,6 +161,7 @@ def _read_image(file: TextFile, line: int, header: bytes, points2d_line: int, po
         linked,
         values[linked, :2],
         ids[linked],
+        int(np.count_nonzero(~np.isfinite(values[ids == UNLINKED, :2]).all(axis=1))),
     )
 
 
