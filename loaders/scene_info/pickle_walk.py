@@ -20,6 +20,7 @@ class RefusedPickleError(Exception):
 _MAX_HASH: Final = 1000  # steps, and levels, of one key
 _MAX_LINE: Final = 4096  # bytes of a number or a name in the text opcodes
 _MAX_INTEGER: Final = 64  # bytes
+_MAX_KEY_DIGITS: Final = 23  # of such an integer, with its sign and an L
 _MAX_KEY: Final = 9  # bytes of an integer as a key; of longer ones, any number can be chosen to collide
 _OBJECT_BYTES: Final = (16 << 20, 16)  # of all objects: this much, and so many times the file
 _HASHES: Final = (100_000, 16)
@@ -210,7 +211,7 @@ class _Walk:
         if op not in _TEXTS and length > 3 * _MAX_INTEGER:
             raise RefusedPickleError(f"a pickle with a number of {length} characters")
         self._num_bytes += 64 + length
-        self._stack.append(_MAX_HASH + 1 if op == pickle.LONG and length > 2 * _MAX_KEY + 1 else 1)
+        self._stack.append(_MAX_HASH + 1 if op == pickle.LONG and length > _MAX_KEY_DIGITS else 1)
 
     def _frame(self) -> None:
         num = self._unpack("<Q")

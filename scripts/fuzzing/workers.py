@@ -34,13 +34,13 @@ class Worker:
     def attempt(self, target: str, case: Case) -> Outcome:
         """Return what came of an input; HANG and CRASH where the process did not say."""
         pipe = self._started()
-        pipe.send((target, case))
         try:
+            pipe.send((target, case))
             if not pipe.poll(self._seconds):
                 self.stop()
                 return Outcome("HANG", f"more than {self._seconds:g} s")
             outcome: Outcome = pipe.recv()
-        except (EOFError, ConnectionResetError):
+        except (EOFError, ConnectionError):
             self._process.join(10)
             code = self._process.exitcode
             self.stop()
