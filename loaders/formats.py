@@ -10,7 +10,7 @@ from sfm_audit.loaders.colmap.formats import BINARY, TEXT
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
 from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.model_format import ModelFormat, ModelWriter
-from sfm_audit.loaders.paths.files import exists, is_folder
+from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
 
 FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT)
@@ -114,4 +114,8 @@ def _incomplete(folder: InputPath, there: list[str]) -> MissingFileError:
         f"{', '.join(meant.required[:-1])} and {meant.required[-1]}" if len(meant.required) > 1 else meant.required[0]
     )
     got = f"only {', '.join(there)}" if there else "none of them"
-    return MissingFileError(str(folder), None, wanted, got, f"add {', '.join(missing)}")
+    other_case = {name.lower(): name for name in names_in(folder) if name not in there}
+    renamed = [f"rename {other_case[name.lower()]} to {name}" for name in missing if name.lower() in other_case]
+    missing = [name for name in missing if name.lower() not in other_case]
+    advice = "; ".join([*renamed, *([f"add {', '.join(missing)}"] if missing else [])])
+    return MissingFileError(str(folder), None, wanted, got, advice)

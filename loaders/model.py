@@ -35,10 +35,14 @@ class FindingCode(StrEnum):
     NON_FINITE_POINTS = "non_finite_points"
     NON_FINITE_CAMERAS = "non_finite_cameras"
     NON_FINITE_OBSERVATIONS = "non_finite_observations"
+    NON_FINITE_UNUSED = "non_finite_unused"
     OBSERVATIONS_OUTSIDE = "observations_outside"
     IMAGE_SIZE_SWAPPED = "image_size_swapped"
     DUPLICATE_NAMES = "duplicate_names"
     INCOMPLETE_RIGS = "incomplete_rigs"
+    SENSORS_DISAGREE = "sensors_disagree"
+    IMPLAUSIBLE_CAMERAS = "implausible_cameras"
+    EXTREME_VALUES = "extreme_values"
     EMPTY_MODEL = "empty_model"
     STATED_COUNT_DIFFERS = "stated_count_differs"
     UNTERMINATED_TEXT = "unterminated_text"
@@ -74,10 +78,14 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.NON_FINITE_POINTS: "3D points that are not finite; their projections count as num_nonfinite",
     FindingCode.NON_FINITE_CAMERAS: "cameras with parameters that are not finite; their images are undetermined",
     FindingCode.NON_FINITE_OBSERVATIONS: "linked 2D points that are not finite",
+    FindingCode.NON_FINITE_UNUSED: "unlinked 2D points, colours or replaced poses that are not finite; not used here",
     FindingCode.OBSERVATIONS_OUTSIDE: "linked 2D points outside of their image",
     FindingCode.IMAGE_SIZE_SWAPPED: "cameras whose principal point says that width and height are swapped",
     FindingCode.DUPLICATE_NAMES: "images that share their name with another one",
     FindingCode.INCOMPLETE_RIGS: "rigs and frames do not place all images, or one of their files is missing",
+    FindingCode.SENSORS_DISAGREE: "rigs, frames, cameras and images name different sensors for each other",
+    FindingCode.IMPLAUSIBLE_CAMERAS: "cameras with a size, focal length or distortion that no camera has",
+    FindingCode.EXTREME_VALUES: "poses, points, 2D points or stored errors that are finite and above 1e12 in magnitude",
     FindingCode.EMPTY_MODEL: "the model has no images, or no 3D points",
     FindingCode.STATED_COUNT_DIFFERS: "a text file says in its head that it holds another number of records",
     FindingCode.UNTERMINATED_TEXT: "a text file does not end its last line: its last number may be cut",
@@ -150,12 +158,13 @@ class ImageRecord:
         """
         w, qx, qy, qz = self.quat_cam_from_world_wxyz
         x, y, z = xyz_world.T
-        ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
-        ux, uy, uz = ux + ux, uy + uy, uz + uz
         out = np.empty(xyz_world.shape)
-        out[:, 0] = x + w * ux + (qy * uz - qz * uy) + self.translation_cam_from_world[0]
-        out[:, 1] = y + w * uy + (qz * ux - qx * uz) + self.translation_cam_from_world[1]
-        out[:, 2] = z + w * uz + (qx * uy - qy * ux) + self.translation_cam_from_world[2]
+        with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # what is not finite projects nowhere
+            ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
+            ux, uy, uz = ux + ux, uy + uy, uz + uz
+            out[:, 0] = x + w * ux + (qy * uz - qz * uy) + self.translation_cam_from_world[0]
+            out[:, 1] = y + w * uy + (qz * ux - qx * uz) + self.translation_cam_from_world[1]
+            out[:, 2] = z + w * uz + (qx * uy - qy * ux) + self.translation_cam_from_world[2]
         return out
 
 
@@ -297,9 +306,10 @@ class InlierSet:
 def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
     """Return (..., 3, 3) matrices of (..., 4) quaternions w x y z, without normalising them, like COLMAP."""
     w, x, y, z = np.moveaxis(np.asarray(quat_wxyz, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # not finite: not finite in the matrix either
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

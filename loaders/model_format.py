@@ -43,6 +43,9 @@ class ModelFormat:
         Reads the model in a folder; raises `loaders.errors.LoadError` where that cannot be done.
     count_images : callable
         Returns the number of images in a folder's model without reading all of it; raises LoadError.
+    check : callable or None
+        Raises LoadError where the records of a folder's files do not fill them; keeps nothing in memory. It is asked
+        before large files are hashed.
     writer : ModelWriter or None
         For `filter --model-out`; None where models of this format are only read.
     keypoint_scales : callable or None
@@ -55,6 +58,7 @@ class ModelFormat:
     read: Callable[[InputPath], RawModel]
     count_images: Callable[[InputPath], int]
     optional: tuple[str, ...] = ()
+    check: Callable[[InputPath], None] | None = None
     writer: ModelWriter | None = None
     keypoint_scales: Callable[[SparseModel, str], FloatArray] | None = None
 

@@ -223,12 +223,14 @@ def _point_line(p: Point) -> str:
 def _rig_line(r: Rig) -> str:
     values = [r.rig_id, len(r.sensors)]
     for position, (kind, sensor_id, pose) in enumerate(r.sensors):
-        values += [SENSOR_NAMES[kind], sensor_id]
+        values += [SENSOR_NAMES.get(kind, kind), sensor_id]
         if position:
             values += [1, *pose] if pose else [0]
     return _join(*values)
 
 
 def _frame_line(f: Frame) -> str:
-    data = [value for kind, sensor_id, data_id in f.data for value in (SENSOR_NAMES[kind], sensor_id, data_id)]
+    data = [
+        value for kind, sensor_id, data_id in f.data for value in (SENSOR_NAMES.get(kind, kind), sensor_id, data_id)
+    ]
     return _join(f.frame_id, f.rig_id, *f.pose, len(f.data), *data)

@@ -18,15 +18,21 @@ from sfm_audit.loaders.paths.locations import parse_location
 from sfm_audit.reports.text.wording import plain
 
 UNKNOWN: Final = "-"
+CHOICE_OF_MODELS: Final = ("layout", "scenes", "components", "scene_lists", "follow_links")
+"""Names of the options that choose models."""
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a user asks for of what lies below the PATHs: models of one layout (None: of any), some of their scenes."""
+    """What a user asks for of what lies below the PATHs: models of one layout (None: of any), some of their scenes.
+
+    follow_links: whether links that lead out of a PATH are followed.
+    """
 
     layout: str | None = None
     selection: Selection = field(default_factory=Selection)
+    follow_links: bool = False
 
 
 def with_choice_of_models(command: _Command) -> _Command:
@@ -46,13 +52,21 @@ def with_choice_of_models(command: _Command) -> _Command:
             type=click.Path(path_type=Path),
             help="Only the scenes named in FILE, one per line: scene, or scene/component.",
         ),
+        click.option("--follow-links", is_flag=True, help="Follow links that lead out of a PATH."),
     )
     for option in reversed(options):
         command = option(command)
     return command
 
 
-def wanted_of(*, layout: str, scenes: Iterable[str], components: Iterable[str], scene_lists: Iterable[Path]) -> Wanted:
+def wanted_of(
+    *,
+    layout: str,
+    scenes: Iterable[str],
+    components: Iterable[str],
+    scene_lists: Iterable[Path],
+    follow_links: bool = False,
+) -> Wanted:
     """Return what the options say.
 
     Raises
@@ -65,7 +79,7 @@ def wanted_of(*, layout: str, scenes: Iterable[str], components: Iterable[str], 
     except LoadError as error:
         raise KnownError(str(error), ExitCode.USAGE) from error
     selection = Selection(tuple(scenes), tuple(components), lists)
-    return Wanted(None if layout == "auto" else layout, selection)
+    return Wanted(None if layout == "auto" else layout, selection, follow_links)
 
 
 def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
@@ -81,7 +95,10 @@ def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
             parse_location(path)
         except LoadError as error:
             raise KnownError(str(error), ExitCode.USAGE) from error
-    return select(discover(paths, wanted.layout), wanted.selection)
+    found = select(discover(paths, wanted.layout, follow_links=wanted.follow_links), wanted.selection)
+    for note in found.notes:
+        click.echo(f"sfm-audit: {plain(note)}", err=True)
+    return found
 
 
 def listed(found: Discovery) -> tuple[list[str], list[str]]:

@@ -10,7 +10,7 @@ import click
 
 from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
 from sfm_audit.audit.cli.errors import ExitCode, complain
-from sfm_audit.audit.cli.finding import find_models, listed, wanted_of, with_choice_of_models
+from sfm_audit.audit.cli.finding import CHOICE_OF_MODELS, find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
 from sfm_audit.audit.schedule.task import Limits
@@ -96,7 +96,7 @@ def command(  # one parameter per option
     in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
     config = read_config(config_file, {name: options[name] for name in ("noise", "points", "min_effect", "policy")})
-    wanted = wanted_of(**{name: options[name] for name in ("layout", "scenes", "components", "scene_lists")})
+    wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
     if options["only_list"]:
         lines, problems = listed(find_models(paths, wanted))
         print_page("\n".join(lines))

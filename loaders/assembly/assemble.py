@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm_audit.loaders.assembly.consistency import find_inconsistencies
+from sfm_audit.loaders.assembly.extremes import unused_nonfinite
 from sfm_audit.loaders.assembly.lookup import rows_of
 from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.assembly.rigs import compose_poses
@@ -26,7 +27,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xyz_world=raw.points.xyz_world[order],
         stored_error_px=raw.points.stored_error_px[order],
     )
-    poses, rig_findings = compose_poses(raw.images, raw.rigs, raw.frames)
+    poses, rig_findings = compose_poses(raw)
     images = ImageTable(
         image_id=raw.images.image_id,
         name=raw.images.name,
@@ -42,7 +43,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xy_px=raw.images.xy_px,
         point_idx=rows_of(points.point3d_id, raw.images.point3d_id),
     )
-    known = raw.findings + rig_findings
+    known = raw.findings + rig_findings + unused_nonfinite(raw, poses)
     model = SparseModel(location, file_format, raw.cameras, images, points, observations, known)
     return SparseModel(
         location,

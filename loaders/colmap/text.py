@@ -38,6 +38,7 @@ from sfm_audit.loaders.paths.text_lines import (
     POINTS,
     TextFile,
     check_count,
+    check_text,
     parse_floats,
     parse_uint,
     read_text,
@@ -79,6 +80,13 @@ def read_model(folder: InputPath) -> RawModel:
         *frame_findings,
     )
     return RawModel(cameras, images, points, rigs, frames, findings)
+
+
+def check_structure(folder: InputPath) -> None:
+    """Raise LoadError where a file of the model holds a NUL byte, as one that was grown by zeros does."""
+    for name in ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"):
+        if exists(folder / name):
+            check_text(folder / name)
 
 
 def read_cameras(file: TextFile) -> CameraTable:
@@ -153,6 +161,7 @@ def _read_image(file: TextFile, line: int, header: bytes, points2d_line: int, po
         linked,
         values[linked, :2],
         ids[linked],
+        int(np.count_nonzero(~np.isfinite(values[ids == UNLINKED, :2]).all(axis=1))),
     )
 
 
@@ -252,7 +261,8 @@ def _read_frame(fields: _Fields) -> RawFrame:
     pose = fields.pose("rig_from_world")
     data = [(fields.sensor(), fields.uint("a data id", 64)) for _ in range(fields.uint("a number of data"))]
     fields.finish()
-    return RawFrame(frame_id, rig_id, pose, tuple(data_id for (kind, _), data_id in data if kind == CAMERA_SENSOR))
+    seen = [(data_id, sensor_id) for (kind, sensor_id), data_id in data if kind == CAMERA_SENSOR]
+    return RawFrame(frame_id, rig_id, pose, tuple(each[0] for each in seen), tuple(each[1] for each in seen))
 
 
 def _uneven(fields: list[bytes], size: int) -> str:

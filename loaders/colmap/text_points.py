@@ -49,6 +49,7 @@ def read_points(file: TextFile) -> RawPoints:
         track_lengths=np.concatenate([batch.track_lengths for batch in batches]),
         track_image_id=tracks[:, 0].copy(),
         track_point2d_idx=tracks[:, 1].copy(),
+        num_unused_nonfinite=int(np.count_nonzero(~np.isfinite(fixed[:, 4:7]).all(axis=1))),
     )
 
 

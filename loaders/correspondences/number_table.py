@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import csv
 import re
+from array import array
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.errors import MalformedFileError, Position
-from sfm_audit.loaders.paths.files import open_input, read_bytes, reading
+from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
 from sfm_audit.loaders.paths.text_lines import TextFile, read_text, repr_token
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
+_BATCH_CELLS: Final = 1 << 16
+_PARQUET_BYTES: Final = (64 << 20, 32)  # of the numbers in a Parquet file: this much, and so many times the file
 _PARQUET_MAGIC: Final = b"PAR1"
 _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _FACT: Final = re.compile(r"(?<![\w=])([A-Za-z_]\w*)=([^\s,;]+)")
@@ -112,8 +116,10 @@ def _read_csv(path: InputPath, known: Collection[str], ignored: Collection[str])
     names = [name.strip() for name in _fields(file, header_line, header)]
     _check_names(str(path), Position("line", header_line), names, known, ignored)
     read = [column for column, name in enumerate(names) if name in known]
-    lines: list[int] = []
+    lines = array("q")
     cells: list[str] = []
+    values = np.empty((len(file.lines), len(read)))
+    num_read = 0
     for line, record in records:
         fields = _fields(file, line, record)
         if len(fields) != len(names):
@@ -125,12 +131,16 @@ def _read_csv(path: InputPath, known: Collection[str], ignored: Collection[str])
                 raise file.malformed(line, f"a finite number in column {names[column]}", got)
             cells.append(cell)
         lines.append(line)
+        if len(cells) >= _BATCH_CELLS:
+            values[num_read : len(lines)] = np.array(cells, dtype=np.float64).reshape(-1, len(read))
+            num_read = len(lines)
+            cells.clear()
     if not lines:
         raise file.truncated("a row below the names of the columns", "none")
     if not file.is_terminated:
         raise file.truncated("a line end after the last row", "none, so its last number may be cut")
-    values = np.array(cells, dtype=np.float64).reshape(len(lines), len(read))
-    columns = {names[column]: values[:, position].copy() for position, column in enumerate(read)}
+    values[num_read : len(lines)] = np.array(cells, dtype=np.float64).reshape(-1, len(read))
+    columns = {names[column]: values[: len(lines), position] for position, column in enumerate(read)}
     facts = _stated_facts(file, header_line)
     return NumberTable(str(path), columns, facts, np.array(lines, dtype=np.int64), header_line)
 
@@ -160,32 +170,58 @@ def _read_parquet(path: InputPath, known: Collection[str], ignored: Collection[s
     import pyarrow as pa  # noqa: PLC0415 - costs what the reader of a CSV file need not pay
     import pyarrow.parquet as pq  # noqa: PLC0415 - as above
 
-    data = read_bytes(path)
+    stream, num_bytes = open_input(path)
     try:
-        table = pq.read_table(pa.BufferReader(data))
-        names = list(table.schema.names)
-        stated = table.schema.metadata or {}
-        facts = {_text(key): _text(value) for key, value in stated.items()}
+        with stream:
+            return _parquet_table(path, pq.ParquetFile(stream), num_bytes, known, ignored)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         got = " ".join(str(error).split())[:120]
         raise MalformedFileError(
             str(path), None, "a Parquet file", f"a damaged one ({got})", _PARQUET_ADVICE
         ) from error
+
+
+def _parquet_table(
+    path: InputPath, file: pq.ParquetFile, num_bytes: int, known: Collection[str], ignored: Collection[str]
+) -> NumberTable:
+    """Read the columns of numbers, one at a time; those of other names must be in ``ignored``."""
+    names = list(file.schema_arrow.names)
+    stated = file.schema_arrow.metadata or {}
+    facts = {_text(key): _text(value) for key, value in stated.items()}
     _check_names(str(path), None, names, known, ignored)
-    if table.num_rows == 0:
+    wanted = [name for name in names if name in known]
+    _check_size(path, file, len(wanted), num_bytes)
+    columns = {name: _numbers(path, name, file.read(columns=[name], use_threads=False)) for name in wanted}
+    if file.metadata.num_rows == 0:
         raise MalformedFileError(str(path), None, "at least one row", "none", _PARQUET_ADVICE)
-    columns = {name: _numbers(path, name, table.column(name)) for name in names if name in known}
     return NumberTable(str(path), columns, facts)
+
+
+def _check_size(path: InputPath, file: pq.ParquetFile, num_columns: int, num_bytes: int) -> None:
+    """Raise where the numbers of the table would take much more memory than the file, as its footer says."""
+    metadata = file.metadata
+    chunks = (
+        metadata.row_group(group).column(column).total_uncompressed_size
+        for group in range(metadata.num_row_groups)
+        for column in range(metadata.num_columns)
+    )
+    needed = max(8 * metadata.num_rows * max(num_columns, 1), sum(max(chunk, 0) for chunk in chunks))
+    most = _PARQUET_BYTES[0] + _PARQUET_BYTES[1] * num_bytes
+    if needed > most or metadata.num_rows < 0:
+        got = f"{metadata.num_rows} rows, {needed} bytes, in a file of {num_bytes} bytes"
+        wanted = f"a table of at most {most} bytes"
+        raise MalformedFileError(str(path), None, wanted, got, "split the table, or write it without repeated values")
 
 
 def _text(value: bytes) -> str:
     return value.decode("utf-8", errors="backslashreplace")
 
 
-def _numbers(path: InputPath, name: str, column: pa.ChunkedArray[Any]) -> FloatArray:
+def _numbers(path: InputPath, name: str, table: pa.Table) -> FloatArray:
     """Return one Parquet column as float64; raises where it holds no numbers, or nothing in some row."""
     import pyarrow as pa  # noqa: PLC0415 - as above
 
+    column = table.column(name)
     wanted = f"a finite number in column {name}"
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
         raise MalformedFileError(str(path), None, f"numbers in column {name}", str(column.type), _PARQUET_ADVICE)

@@ -31,8 +31,9 @@ from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import parse_location
 from sfm_audit.loaders.paths.text_lines import repr_token
 
-_BATCH: Final = 1 << 18  # lines that are parsed at once
+_BATCH: Final = 1 << 16  # lines that are parsed at once
 _MAX_LINE: Final = 4096  # bytes; a longer one is no line of this format
+_MIN_LINE: Final = 8  # bytes of "0 0 0 0" and the line's end
 _HEADER_COUNTS: Final = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 _HEADER_NAMES: Final = (
     "the number of columns",
@@ -50,7 +51,7 @@ _ADVICE: Final = "check that this is a PTX file, or export the scan again"
 def read_ptx(location: str | Path) -> GriddedScan:
     """Read the scan in a PTX file.
 
-    Memory: the points as float64, twice (24 bytes a point each), however long the lines are.
+    Memory: the points as float64 (24 bytes a point), however long the lines are.
 
     Raises
     ------
@@ -58,11 +59,15 @@ def read_ptx(location: str | Path) -> GriddedScan:
         The file cannot be read, is no PTX file, holds fewer points than it states, more than one scan, or no point.
     """
     path = parse_location(location)
-    file, _ = open_input(path)
+    file, size = open_input(path)
     with file, reading(path):
         lines = _Lines(str(path), file)
         num_columns, num_rows, transformation = _read_header(lines)
-        xyz = _read_points(lines, num_columns * num_rows)
+        num, most = num_columns * num_rows, size // _MIN_LINE
+        if num > most + 1:  # the last line may lack its end
+            wanted = f"{num} points, columns times rows, at least {num * _MIN_LINE} bytes"
+            raise lines.truncated(wanted, f"a file of {size} bytes")
+        xyz = _read_points(lines, num)
         rest = lines.next_filled()
     if rest is not None:
         wanted, got = "the end of the file after its scan", repr_token(rest)
@@ -70,10 +75,11 @@ def read_ptx(location: str | Path) -> GriddedScan:
     is_missing = ~xyz.any(axis=1)
     if is_missing.all():
         raise MalformedFileError(lines.path, None, "a point", "a scan without any return", _ADVICE)
-    xyz_world = xyz @ transformation[:3, :3]
-    xyz_world += transformation[3, :3]
-    xyz_world[is_missing] = np.nan
-    return GriddedScan(xyz_world.reshape(num_columns, num_rows, 3).transpose(1, 0, 2), lines.path)
+    for first in range(0, num, _BATCH):  # in place: the points are in memory once
+        part = slice(first, first + _BATCH)
+        xyz[part] = xyz[part] @ transformation[:3, :3] + transformation[3, :3]
+    xyz[is_missing] = np.nan
+    return GriddedScan(xyz.reshape(num_columns, num_rows, 3).transpose(1, 0, 2), lines.path)
 
 
 @dataclass(slots=True)
@@ -138,7 +144,7 @@ def _numbers(lines: _Lines, tokens: list[bytes], what: str) -> FloatArray:
 
 def _read_points(lines: _Lines, num: int) -> FloatArray:
     """Return the points (num, 3) as the file has them, scanner frame."""
-    batches: list[FloatArray] = []
+    xyz = np.empty((num, 3))
     num_read, line_length = 0, 0
     while num_read < num:
         first = lines.number + 1
@@ -149,9 +155,9 @@ def _read_points(lines: _Lines, num: int) -> FloatArray:
         values = _parse_quickly(batch, line_length)
         if values is None:
             values = _parse_strictly(_Lines(lines.path, lines.file, first), batch, line_length)
-        batches.append(values)
+        xyz[num_read : num_read + len(batch)] = values
         num_read += len(batch)
-    return np.concatenate(batches)
+    return xyz
 
 
 def _parse_quickly(batch: list[bytes], line_length: int) -> FloatArray | None:

@@ -22,6 +22,7 @@ from sfm_audit.loaders.datasets.layouts import (
     place_of,
     without_copies,
 )
+from sfm_audit.loaders.datasets.walk import LIMITS, Folder, leads_out, walk
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
 from sfm_audit.loaders.formats import format_names, marks_model, model_file_names
 from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
@@ -29,6 +30,7 @@ from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, belo
 
 _REQUESTS_AT_ONCE: Final = 16  # to an object store: its answers take their time, and not this machine's
 _EXAMPLES: Final = 3
+FOLLOW: Final = "give --follow-links if you trust them"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +63,13 @@ class Discovery:
     """The models found, sorted by dataset, scene, component and location, and the paths in which there are none.
 
     left_out: models that were found and not asked for, by another layout than the one wanted or `selection`.
+    notes: one line per PATH in which links to the outside were not followed; they are no errors.
     """
 
     refs: tuple[ModelRef, ...]
     errors: tuple[LoadError, ...]
     left_out: tuple[ModelRef, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,19 +81,21 @@ class _Found:
     stamp: str = ""
 
 
-def discover(paths: Sequence[str | Path], layout: str | None = None) -> Discovery:
+def discover(paths: Sequence[str | Path], layout: str | None = None, *, follow_links: bool = False) -> Discovery:
     """Find all models at and below ``paths``.
 
     A folder that holds any of COLMAP's model files counts as a model, so that a broken one is reported when it is
-    opened instead of vanishing; nothing below it is searched, but hloc's ``models``. Hidden folders are skipped, links
-    are followed, loops are not. A model that several paths lead to is named once, after the first of them. Of D2-Net's
-    two copies of a model the binary one is taken.
+    opened instead of vanishing; nothing below it is searched, but hloc's ``models``. Hidden folders are skipped. Links
+    inside a path are followed, loops end; links to its outside are not followed. A model that several paths lead to is
+    named once, after the first of them. Of D2-Net's two copies of a model the binary one is taken.
 
     Parameters
     ----------
     paths : model folders, their parents, or data set roots; of this machine, or s3://..., gs://...
     layout : a name in `layouts.LAYOUTS`: models elsewhere are left out; None: every model by the first layout
         that knows its folder's names
+    follow_links : whether to follow links to folders outside of a path, and read files through such links; a path that
+        is itself a link is always followed
 
     Returns
     -------
@@ -101,9 +107,11 @@ def discover(paths: Sequence[str | Path], layout: str | None = None) -> Discover
     refs: dict[str, ModelRef] = {}
     left_out: dict[str, ModelRef] = {}
     errors: list[LoadError] = []
+    notes: list[str] = []
     for path in paths:
-        found = _models_below(path, wanted)
+        found = _models_below(path, wanted, follow_links=follow_links)
         errors += found.errors
+        notes += found.notes
         for ref in found.refs:
             refs.setdefault(ref.location, ref)
         for ref in found.left_out:
@@ -112,6 +120,7 @@ def discover(paths: Sequence[str | Path], layout: str | None = None) -> Discover
         in_order(refs.values()),
         tuple(errors),
         in_order(ref for location, ref in left_out.items() if location not in refs),
+        tuple(notes),
     )
 
 
@@ -120,16 +129,17 @@ def in_order(refs: Iterable[ModelRef]) -> tuple[ModelRef, ...]:
     return tuple(sorted(refs, key=lambda ref: (ref.dataset, ref.scene, ref.component, ref.location)))
 
 
-def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
+def _models_below(given: str | Path, layout: Layout | None, *, follow_links: bool) -> Discovery:
     try:
         root = parse_location(given)
     except LoadError as error:
         return Discovery((), (error,))
     try:
         _check_root(root)
-        found, errors = _search(root, layout)
+        searched = _search(root, layout, follow_links=follow_links)
     except LoadError as error:  # named as the user typed it
         return Discovery((), (type(error)(str(given), error.position, error.wanted, error.got, error.advice),))
+    found, errors = searched.found, searched.errors
     named_parts = root.parts if isinstance(root, RemotePath) else _named_parts(root)
     dataset = named_parts[-1] if named_parts else str(root)
     places = {each.parts: place_of(named_parts + each.parts, layout) for each in found}
@@ -145,7 +155,14 @@ def _models_below(given: str | Path, layout: Layout | None) -> Discovery:
             left_out.append(_ref(dataset, other, model_path, each))
     if not refs and not errors:
         errors.append(_nothing_found(str(given), left_out, layout))
-    return Discovery(tuple(refs), tuple(errors), tuple(left_out))
+    return Discovery(tuple(refs), tuple(errors), tuple(left_out), _notes(str(given), searched.links_out))
+
+
+def _notes(given: str, links_out: Sequence[str]) -> tuple[str, ...]:
+    if not links_out:
+        return ()
+    more = f" and {len(links_out) - 1} more" if len(links_out) > 1 else ""
+    return (f"{given}: links to folders outside of it are not followed: {links_out[0]}{more}; {FOLLOW}",)
 
 
 def _check_root(root: InputPath) -> None:
@@ -166,7 +183,7 @@ def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef
 def _nothing_found(given: str, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:
     if layout is None or not left_out:
         wanted, got = "a model folder at or below it", f"no file of a model ({', '.join(format_names())})"
-        return MissingFileError(given, None, wanted, got, "name a folder that holds COLMAP models")
+        return MissingFileError(given, None, wanted, got, "name a folder that holds models")
     examples = ", ".join(ref.model_path for ref in left_out[:_EXAMPLES])
     return MissingFileError(
         given,
@@ -188,42 +205,68 @@ def scene_and_component(parts: Parts) -> tuple[str, str]:
     return (place.scene, place.component) if place else ("", ONLY_COMPONENT)
 
 
-def _search(root: InputPath, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
-    """Return the model folders at and below ``root``, and what cannot be searched."""
-    return _search_remote(root, layout) if isinstance(root, RemotePath) else _search_local(root, layout)
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """The model folders below a root, what cannot be searched, and links to the outside that were not followed."""
+
+    found: list[_Found]
+    errors: list[LoadError]
+    links_out: list[str] = field(default_factory=list)
 
 
-def _search_local(root: Path, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
+def _search(root: InputPath, layout: Layout | None, *, follow_links: bool) -> _Search:
+    """Return the model folders at and below ``root``, and what was not searched."""
+    if isinstance(root, RemotePath):
+        return _search_remote(root, layout)
+    return _search_local(root, layout, follow_links=follow_links)
+
+
+def _search_local(root: Path, layout: Layout | None, *, follow_links: bool) -> _Search:
     found: list[_Found] = []
-    errors: list[LoadError] = []
-    visited: set[str] = set()
     root_parts = _named_parts(root)
+    errors: list[LoadError] = []
 
-    def note(error: OSError) -> None:
-        got = error.strerror or type(error).__name__
-        errors.append(UnreadableFileError(str(error.filename), None, "a readable folder", got, "check its permissions"))
-
-    for folder, folders, files in os.walk(root, followlinks=True, onerror=note):
-        real = os.path.realpath(folder)
-        if real in visited:
-            folders[:] = []
-            continue
-        visited.add(real)
-        parts = Path(folder).relative_to(root).parts
-        is_model = marks_model([*files, *folders])
+    def visit(folder: Folder) -> Sequence[str]:
+        is_model = marks_model([*folder.files, *folder.folders])
         if is_model:
-            found.append(_Found(parts, size_of(model_files_in(Path(folder)))))
-        folders[:] = folders_to_search(root_parts + parts, folders, is_model=is_model, layout=layout)
-    return found, errors
+            out = [] if follow_links else _files_out(folder, root)
+            if out:
+                errors.append(_leads_out(folder.path, out))
+            else:
+                found.append(_Found(folder.parts, size_of(model_files_in(folder.path))))
+        folders = list(folder.folders)
+        return folders_to_search(root_parts + folder.parts, folders, is_model=is_model, layout=layout)
+
+    met = walk(root, visit, follow_links=follow_links)
+    return _Search(found, errors + met.errors, met.links_out)
 
 
-def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found], list[LoadError]]:
-    """Ask level by level, many folders at once."""
+def _files_out(folder: Folder, root: Path) -> list[str]:
+    """Names of a model's files that are links to the outside of the PATH."""
+    there = {*folder.files, *folder.folders}
+    return [name for name in model_file_names() if name in there and leads_out(folder.path / name, root)]
+
+
+def _leads_out(folder: Path, names: list[str]) -> LoadError:
+    got = f"links to the outside: {', '.join(names)}"
+    return UnreadableFileError(str(folder), None, "files that lie inside the PATH", got, FOLLOW)
+
+
+def _search_remote(root: RemotePath, layout: Layout | None) -> _Search:
+    """Ask level by level, many folders at once; no deeper and no more than a walk on this machine."""
     found: list[_Found] = []
     errors: list[LoadError] = []
     level: list[tuple[Parts, RemotePath]] = [((), root)]
     with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
+        depth = num_folders = 0
         while level:
+            num_folders += len(level)
+            if depth > LIMITS.max_depth or num_folders > LIMITS.max_folders:
+                got = f"{len(level)} folders more than {depth} deep, or more than {LIMITS.max_folders} in all"
+                advice = "name the folders with the models"
+                errors.append(LoadError(str(root), None, "a data set that can be searched", got, advice))
+                break
+            depth += 1
             asked = list(pool.map(lambda each: _listing_or_error(each[1]), level))
             below_it: list[tuple[Parts, RemotePath]] = []
             for (parts, folder), listing in zip(level, asked, strict=True):
@@ -238,7 +281,7 @@ def _search_remote(root: RemotePath, layout: Layout | None) -> tuple[list[_Found
                 folders = folders_to_search(folder.parts, folders, is_model=is_model, layout=layout)
                 below_it += [((*parts, name), replace(folder, parts=(*folder.parts, name))) for name in folders]
             level = below_it
-    return sorted(found, key=lambda each: each.parts), errors
+    return _Search(sorted(found, key=lambda each: each.parts), errors)
 
 
 def _listing_or_error(folder: RemotePath) -> Mapping[str, Entry] | LoadError:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from sfm_audit.loaders.formats import files_of
+from sfm_audit.loaders.formats import files_of, format_of
 from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath, RemotePath, parse_location
+
+_LARGE_BYTES: Final = 1 << 28  # below it, hashing takes less than a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +39,19 @@ def input_files(path: str | Path) -> tuple[InputFile, ...]:
 
 
 def files_in(folder: InputPath) -> tuple[InputFile, ...]:
-    """Return the same for a location that was parsed."""
+    """Return the same for a location that was parsed.
+
+    Where a file is large, the structure of all files is checked first: a file that was grown by terabytes of zeros is
+    refused without being read to its end.
+    """
+    check = format_of(folder).check
+    if check is not None and isinstance(folder, Path) and any(_is_large(path) for path in files_of(folder)):
+        check(folder)
     return tuple(_remote(path) if isinstance(path, RemotePath) else _hashed(path) for path in files_of(folder))
+
+
+def _is_large(path: InputPath) -> bool:
+    return isinstance(path, Path) and path.exists() and path.stat().st_size > _LARGE_BYTES
 
 
 def _remote(path: RemotePath) -> InputFile:

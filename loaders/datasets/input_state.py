@@ -51,6 +51,24 @@ def read_input_state(location: str) -> InputState:
     return InputState(sum(file.num_bytes for file in files), stamp_of(found), digest)
 
 
+def is_unchanged(location: str, known: InputState, *, verify: bool) -> bool:
+    """Whether the files of a model are those of a known state.
+
+    Parameters
+    ----------
+    verify : compare the content, which costs reading all of it; otherwise equal names, sizes and times of change are
+        taken for equal content, which copying with ``cp -p``, ``rsync -t`` or ``touch -r`` can make untrue
+
+    Raises
+    ------
+    LoadError
+        Where ``verify`` and a file is missing or cannot be read.
+    """
+    if input_stamp(location) != known.stamp:
+        return read_input_state(location).digest == known.digest
+    return not verify or read_input_state(location).digest == known.digest
+
+
 def input_size(location: str) -> int:
     """Return the size in bytes of the files that the model is read from, 0 where there are none."""
     return size_of(model_files_in(parse_location(location)))

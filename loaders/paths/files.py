@@ -13,6 +13,7 @@ from typing import Final
 from sfm_audit.loaders.errors import (
     LfsPointerError,
     LoadError,
+    MalformedFileError,
     MissingFileError,
     TruncatedFileError,
     UnreadableFileError,
@@ -47,6 +48,16 @@ def listing_of(folder: RemotePath) -> Mapping[str, Entry]:
     if not folder.listings:
         folder.listings.append(list_folder(folder))
     return folder.listings[0]
+
+
+def names_in(folder: InputPath) -> tuple[str, ...]:
+    """Return the names in a folder; none where it cannot be listed."""
+    try:
+        if isinstance(folder, RemotePath):
+            return tuple(listing_of(folder))
+        return tuple(path.name for path in folder.iterdir())
+    except (OSError, LoadError):
+        return ()
 
 
 def is_folder(path: InputPath) -> bool:
@@ -93,18 +104,79 @@ def _open_remote(path: RemotePath, *, only_head: bool) -> tuple[BufferedReader, 
 
 
 def _open_local(path: Path) -> tuple[BufferedReader, int]:
+    if path.is_symlink() and not path.exists():
+        got = f"a link to nothing ({os.readlink(path)})"  # noqa: PTH115 - the text of the link, whatever it is
+        raise MissingFileError(str(path), None, "a file", got, _COPY_AGAIN)
+    return open_regular(path, "put the reconstruction's file in its place")
+
+
+def open_regular(path: Path, advice: str = "put a regular file in its place") -> tuple[BufferedReader, int]:
+    """Open a regular file of this machine; every file that this program reads is opened here.
+
+    A pipe, device or socket is refused without waiting for its other end: nothing is opened that was not asked first,
+    and what was opened is asked again, in case it was exchanged in between.
+
+    Returns
+    -------
+    tuple
+        The file, positioned at its start, and its size in bytes.
+
+    Raises
+    ------
+    MissingFileError, UnreadableFileError
+        There is no such file, it is no regular one, or it cannot be opened.
+    """
     try:
         mode = path.stat().st_mode
-        if stat.S_ISREG(mode):  # asked before opening: opening a pipe would wait for its writer
-            file = path.open("rb")
+        if not stat.S_ISREG(mode):
+            raise _not_regular(path, mode, advice)
+        file = _open_without_waiting(path)
     except FileNotFoundError:
-        raise MissingFileError(str(path), None, "a file", "nothing", _COPY_AGAIN) from None
-    except OSError as error:
+        raise MissingFileError(str(path), None, "a file", "nothing", "check the path") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
         raise _unreadable(path, error) from error
-    if not stat.S_ISREG(mode):
-        got = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
-        raise UnreadableFileError(str(path), None, "a file", got, "put the reconstruction's file in its place")
-    return file, os.fstat(file.fileno()).st_size
+    opened = os.fstat(file.fileno())
+    if not stat.S_ISREG(opened.st_mode):
+        file.close()
+        raise _not_regular(path, opened.st_mode, advice)
+    return file, opened.st_size
+
+
+def read_small(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file of this machine that should be small, such as a file of settings.
+
+    Raises
+    ------
+    LoadError
+        As of `open_regular`; MalformedFileError for a file of more than ``max_bytes``, of which no more is read.
+    """
+    file, _ = open_regular(path)
+    with file, reading(path):
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise MalformedFileError(str(path), None, f"at most {max_bytes} bytes", "more", "name another file")
+    return content
+
+
+def _open_without_waiting(path: Path) -> BufferedReader:
+    """Open a file; where a pipe has taken its place in the meantime, do not wait for the pipe's writer."""
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
+    return os.fdopen(os.open(path, flags), "rb")
+
+
+def _not_regular(path: Path, mode: int, advice: str) -> UnreadableFileError:
+    return UnreadableFileError(str(path), None, "a file", _kind_of(mode), advice)
+
+
+def _kind_of(mode: int) -> str:
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a named pipe",
+        stat.S_IFSOCK: "a socket",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+    }
+    return kinds.get(stat.S_IFMT(mode), "neither a file nor a folder")
 
 
 def _check_content(path: InputPath, file: BufferedReader, size: int) -> None:
@@ -133,6 +205,6 @@ def reading(path: InputPath) -> Iterator[None]:
         raise _unreadable(path, error) from error
 
 
-def _unreadable(path: InputPath, error: OSError) -> UnreadableFileError:
-    got = error.strerror or type(error).__name__
+def _unreadable(path: InputPath, error: OSError | ValueError) -> UnreadableFileError:
+    got = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return UnreadableFileError(str(path), None, "a readable file", got, "check its permissions and its disk")

@@ -12,12 +12,13 @@ import numpy as np
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.errors import MalformedFileError, Position, TruncatedFileError
 from sfm_audit.loaders.model import Finding, FindingCode
-from sfm_audit.loaders.paths.files import read_bytes
+from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
 
 _STATED_COUNT: Final = re.compile(rb"#\s*Number of (?:cameras|images|points|rigs|frames)\s*:\s*(\d{1,18})(?!\d)")
 POINTS: Final = "3D points"
 _BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
+_PIECE_BYTES: Final = 1 << 25
 _ADVICE: Final = "check that this is COLMAP's text format, or export the reconstruction again"
 _RECOPY: Final = "copy or export the reconstruction again"
 
@@ -53,18 +54,43 @@ class TextFile:
 
 def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
     """Read a text file; errors as of `loaders.paths.files.open_input`, and MalformedFileError where it is no text."""
-    data = read_bytes(path).removeprefix(_BYTE_ORDER_MARK)
-    nul = data.find(b"\0")
-    if nul >= 0:
-        line = data.count(b"\n", 0, nul) + 1
-        raise MalformedFileError(str(path), Position("line", line), "text", "a NUL byte", advice)
-    lines = data.split(b"\n")
+    lines: list[bytes] = []
+    begun: list[bytes] = []  # pieces of a line that goes on
+    for piece in _pieces(path, advice):
+        first, *more = piece.split(b"\n")
+        begun.append(first)
+        if more:
+            lines.append(b"".join(begun))
+            begun = [more.pop()]
+            lines += more
+    lines.append(b"".join(begun))
+    lines[0] = lines[0].removeprefix(_BYTE_ORDER_MARK)
     is_terminated = not lines[-1]
     if is_terminated:
         lines.pop()
     comments = (line for line in lines if line.lstrip().startswith(b"#"))
     stated = next((match for line in comments if (match := _STATED_COUNT.match(line.lstrip()))), None)
     return TextFile(path, lines, int(stated[1]) if stated else None, is_terminated, advice)
+
+
+def check_text(path: InputPath, advice: str = _ADVICE) -> None:
+    """Raise MalformedFileError where a file holds a NUL byte; nothing behind the first one is read."""
+    for _ in _pieces(path, advice):
+        pass
+
+
+def _pieces(path: InputPath, advice: str) -> Iterator[bytes]:
+    """Yield a file in pieces; raises at the first NUL byte."""
+    file, _ = open_input(path)
+    line = 1
+    with file, reading(path):
+        while piece := file.read(_PIECE_BYTES):
+            nul = piece.find(b"\0")
+            if nul >= 0:
+                line += piece.count(b"\n", 0, nul)
+                raise MalformedFileError(str(path), Position("line", line), "text", "a NUL byte", advice)
+            line += piece.count(b"\n")
+            yield piece
 
 
 def check_count(

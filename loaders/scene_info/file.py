@@ -8,6 +8,8 @@ Both may hold pickled objects, so nothing here is read by numpy's or Python's ow
 from __future__ import annotations
 
 import io
+import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -24,10 +26,11 @@ from sfm_audit.loaders.scene_info.inert_pickle import (
     NEW_CORE,
     OLD_CORE,
     InertPickle,
-    RefusedPickleError,
     array_from_bytes,
+    dtype_of_code,
     load_inert,
 )
+from sfm_audit.loaders.scene_info.pickle_walk import RefusedPickleError
 
 Array = npt.NDArray[Any]
 PER_IMAGE: Final = ("image_paths", "depth_paths", "intrinsics", "poses", "fact_x", "fact_y")
@@ -35,11 +38,13 @@ MATRICES: Final = ("overlap_matrix", "scale_ratio_matrix")
 
 _SUFFIX: Final = ".npy"
 _ZIP_MAGIC: Final = b"PK\x03\x04"
-_EXPANSION: Final = 1 << 33  # bytes that the members of one file may hold together once decompressed
-_NPY_HEADERS: Final = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+_EXPANSION: Final = (64 << 20, 64)  # bytes of all members once decompressed: this much, and so many times the file
+_NPY_LENGTHS: Final = {b"\x93NUMPY\x01\x00": "<H", b"\x93NUMPY\x02\x00": "<I"}
+_NPY_HEADER: Final = re.compile(
+    rb"\{'descr': '([^'\\]{1,20})', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:[0-9]{1,18}L?(?:, [0-9]{1,18}L?)*,?)?)\), \}[ \n]*"
+)
+_MAX_HEADER: Final = 4096
 _FETCH: Final = "fetch the file again from a source that you trust"
 
 
@@ -173,8 +178,12 @@ def _read_npz(data: bytes) -> tuple[dict[str, NpzMember], dict[str, Any]]:
     values: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _EXPANSION:
-                raise RefusedPickleError(f"an archive of more than {_EXPANSION >> 30} GiB")
+            expanded, most = (
+                sum(entry.file_size for entry in archive.infolist()),
+                _EXPANSION[0] + _EXPANSION[1] * len(data),
+            )
+            if expanded > most:
+                raise RefusedPickleError(f"an archive of {len(data)} bytes that holds {expanded}, more than {most}")
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(_SUFFIX)
                 if name in members or not entry.filename.endswith(_SUFFIX):
@@ -193,19 +202,30 @@ def _read_npz(data: bytes) -> tuple[dict[str, NpzMember], dict[str, Any]]:
 
 def _read_npy(content: bytes) -> tuple[Array, InertPickle | None]:
     """Return the array of a .npy file, and how its pickle was written where it holds objects."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version not in _NPY_HEADERS:
-        raise RefusedPickleError(f"an array in version {version[0]}.{version[1]} of the .npy format")
-    shape, is_fortran, dtype = _NPY_HEADERS[version](stream)
-    rest = content[stream.tell() :]
+    shape, order, dtype, start = _npy_header(content)
+    rest = content[start:]
     if not dtype.hasobject:
-        return array_from_bytes(rest, dtype, shape, "F" if is_fortran else "C"), None
+        return array_from_bytes(rest, dtype, shape, order), None
     inert = load_inert(rest)
     array = inert.value
     if not isinstance(array, np.ndarray) or array.dtype != object or array.shape != shape:
         raise RefusedPickleError("an array of objects that is none, or has another shape than its header says")
     return array, inert
+
+
+def _npy_header(content: bytes) -> tuple[tuple[int, ...], str, np.dtype[Any], int]:
+    """Return shape, order, dtype and the first byte of the content; numpy's own reader would evaluate an expression."""
+    layout = _NPY_LENGTHS.get(content[:8])
+    if layout is None:
+        raise RefusedPickleError(f"an array that begins with {content[:8]!r}, no .npy of version 1 or 2")
+    at = 8 + struct.calcsize(layout)
+    length = struct.unpack(layout, content[8:at])[0] if len(content) >= at else 0
+    match = _NPY_HEADER.fullmatch(content[at : at + length]) if length <= _MAX_HEADER else None
+    if match is None:
+        raise RefusedPickleError("an array with a header that numpy does not write")
+    sides = match[3].replace(b"L", b"").split(b",")
+    shape = tuple(int(side) for side in sides if side.strip())
+    return shape, "F" if match[2] == b"True" else "C", dtype_of_code(match[1].decode("latin1")), at + length
 
 
 __all__ = [

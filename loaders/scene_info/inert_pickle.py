@@ -19,18 +19,18 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from sfm_audit.loaders.scene_info.pickle_walk import RefusedPickleError, check_opcodes
+
 Array = npt.NDArray[Any]
 OLD_CORE: Final = "numpy.core"  # what NumPy 1 wrote, and what every version reads
 NEW_CORE: Final = "numpy._core"
 
+_STEPS: Final = (100_000, 8)  # values looked at: this many, and so many per byte of the file
+_ARRAY_BYTES: Final = (4 << 20, 4)  # of all arrays, likewise
 _MAX_DEPTH: Final = 64
 _MAX_DIMENSIONS: Final = 32
 _DTYPE: Final = re.compile(r"(?P<order>[<>=|]?)(?P<code>b1|[iu][1248]|f[248]|c8|c16|[SU][1-9][0-9]{0,8}|O8?)")
 _LEAVES: Final = frozenset({type(None), bool, int, float, str, bytes, bytearray})
-
-
-class RefusedPickleError(Exception):
-    """A pickle that holds something else than numpy arrays and builtin containers, or is damaged; nothing was run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,10 @@ def load_inert(data: bytes) -> InertPickle:
     RefusedPickleError
         Anything else, the global that it asks for named; damaged pickles.
     """
+    check_opcodes(data)
     unpickler = _Unpickler(io.BytesIO(data))
     try:
-        value = _Resolver().resolve(unpickler.load())
+        value = _Resolver(len(data)).resolve(unpickler.load())
     except RefusedPickleError:
         raise
     except (
@@ -71,6 +72,7 @@ def load_inert(data: bytes) -> InertPickle:
         AttributeError,
         OverflowError,
         MemoryError,
+        RecursionError,
         ImportError,
     ) as error:  # the kinds that Python's documentation names for damaged pickles
         raise RefusedPickleError(f"a damaged pickle ({' '.join(str(error).split())[:120]})") from error
@@ -160,13 +162,18 @@ class _Unpickler(pickle.Unpickler):
 class _Resolver:
     """Makes arrays from recorded calls, in new containers; objects that the pickle shares stay shared."""
 
-    def __init__(self) -> None:
+    def __init__(self, num_bytes: int) -> None:
+        self._steps_left = _STEPS[0] + _STEPS[1] * num_bytes
+        self._bytes_left = _ARRAY_BYTES[0] + _ARRAY_BYTES[1] * num_bytes
         self._done: dict[int, Any] = {}
         self._open: set[int] = set()
 
     def resolve(self, value: Any, depth: int = 0) -> Any:
         """Return ``value`` with every note in it replaced by the array, dtype or scalar that it describes."""
         kind = type(value)
+        self._steps_left -= 1
+        if self._steps_left < 0:
+            raise RefusedPickleError("a pickle that names the same objects too often for its size")
         if kind in _LEAVES:
             return value
         if id(value) in self._done:
@@ -201,9 +208,10 @@ class _Resolver:
         _, shape, dtype_note, is_fortran, content = note.state
         dtype, order = self._dtype_of(dtype_note), "F" if is_fortran is True else "C"
         if dtype.kind != "O":
-            return array_from_bytes(self.resolve(content, depth), dtype, shape, order)
+            return self._array(self.resolve(content, depth), dtype, shape, order)
         if type(content) is not list or len(content) != num_items(shape):
             raise RefusedPickleError("an array of objects with another number of them than its shape says")
+        self._take(8 * len(content))
         flat = np.empty(len(content), dtype=object)
         for position, item in enumerate(content):  # one by one: numpy would spread a list over the elements
             flat[position] = self.resolve(item, depth)
@@ -215,29 +223,26 @@ class _Resolver:
         content, dtype_note, shape, order, *axes = (*note.args, None) if len(note.args) == 4 else note.args
         if order not in {"C", "F", "K"} or len(axes) != 1:
             raise RefusedPickleError("a pickle of an array in an unknown order")
-        array = array_from_bytes(content, self._dtype_of(dtype_note), shape, "F" if order == "F" else "C")
+        array = self._array(content, self._dtype_of(dtype_note), shape, "F" if order == "F" else "C")
         return array.transpose(axes[0]) if order == "K" and axes[0] is not None else array
 
     def _scalar(self, note: _Note, depth: int) -> Any:
         """A numpy scalar: (dtype, bytes)."""
         dtype_note, content = note.args
-        return array_from_bytes(self.resolve(content, depth), self._dtype_of(dtype_note), (1,), "C")[0]
+        return self._array(self.resolve(content, depth), self._dtype_of(dtype_note), (1,), "C")[0]
 
     def _dtype(self, note: _Note, depth: int) -> np.dtype[Any]:
         """A dtype: (code, align, copy), state (version, byte order, subarray, names, fields, size, align, flags)."""
         del depth
         code = note.args[0] if note.args else None
-        match = _DTYPE.fullmatch(code) if type(code) is str else None
-        if match is None:
-            raise RefusedPickleError(f"an array of the unsupported type {str(code)[:40]!r}")
-        order: Any = match["order"] or "="
+        dtype = dtype_of_code(code)
+        order: Any = code[0] if type(code) is str and code[0] in "<>=|" else "="
         if note.state is not None:
             if type(note.state) is not tuple or len(note.state) < 5 or note.state[2:5] != (None, None, None):
                 raise RefusedPickleError("an array of a type with fields")
             order = note.state[1]
         if order not in {"<", ">", "=", "|"}:
             raise RefusedPickleError("an array of an unknown byte order")
-        dtype: np.dtype[Any] = np.dtype("O" if match["code"][0] == "O" else match["code"])
         return dtype if dtype.kind == "O" or order in "|=" else dtype.newbyteorder(order)
 
     def _encode(self, note: _Note, depth: int) -> bytes:
@@ -260,11 +265,29 @@ class _Resolver:
     def _frozenset(self, note: _Note, depth: int) -> frozenset[Any]:
         return frozenset(self._set(note, depth))
 
+    def _array(self, content: Any, dtype: np.dtype[Any], shape: Any, order: str) -> Array:
+        self._take(len(content) if type(content) in {bytes, bytearray} else 0)
+        return array_from_bytes(content, dtype, shape, order)
+
+    def _take(self, num_bytes: int) -> None:
+        """Count the bytes of an array: content that many arrays share is in the file only once."""
+        self._bytes_left -= num_bytes
+        if self._bytes_left < 0:
+            raise RefusedPickleError("a pickle whose arrays take more memory than its size allows")
+
     def _dtype_of(self, note: Any) -> np.dtype[Any]:
         if type(note) is not _Note or note.call != "dtype":
             raise RefusedPickleError("an array whose type is no numpy.dtype")
         dtype: np.dtype[Any] = self.resolve(note)
         return dtype
+
+
+def dtype_of_code(code: Any) -> np.dtype[Any]:
+    """Return the dtype that a code such as ``<f8`` names; RefusedPickleError where it has fields, or is none."""
+    match = _DTYPE.fullmatch(code) if type(code) is str else None
+    if match is None:
+        raise RefusedPickleError(f"an array of the unsupported type {str(code)[:40]!r}")
+    return np.dtype("O") if match["code"][0] == "O" else np.dtype(f"{match['order'].replace('|', '')}{match['code']}")
 
 
 def num_items(shape: Any) -> int:

@@ -98,7 +98,7 @@ def _raw_points(model: Model):
     from pathlib import Path  # noqa: PLC0415
     from tempfile import TemporaryDirectory  # noqa: PLC0415
 
-    from sfm_audit.loaders.colmap.binary import read_points  # noqa: PLC0415
+    from sfm_audit.loaders.colmap.binary_points import read_points  # noqa: PLC0415
 
     with TemporaryDirectory() as folder:
         return read_points(write_binary(Path(folder), model) / "points3D.bin")

@@ -17,6 +17,7 @@ from sfm_audit.loaders import (
     input_files,
     open_model,
 )
+from sfm_audit.loaders.paths import files
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:89fc9e4e08ae\nsize 128\n"
 BINARY, TEXT = tuple(binary_files(rig_model())), tuple(text_files(rig_model()))
@@ -75,7 +76,7 @@ def test_permission_and_disk_errors_are_load_errors(tmp_path: Path, monkeypatch:
     def refuse(*_args: object):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(files, "_open_without_waiting", refuse)
     with pytest.raises(UnreadableFileError, match=r"cameras.bin: .* found Permission denied"):
         open_model(tmp_path)
 

@@ -107,7 +107,7 @@ def test_a_carriage_return_is_white_space_and_the_last_line_may_be_unended(tmp_p
 
 
 def test_a_scan_with_fewer_points_than_stated_is_cut(tmp_path):
-    with pytest.raises(TruncatedFileError, match="expected 999999999000 points, columns times rows, found 3"):
+    with pytest.raises(TruncatedFileError, match="expected 999999999000 points, columns times rows, at least"):
         read_ptx(written(tmp_path, ptx(999_999_999, 1000, [P] * 3)))
     with pytest.raises(LfsPointerError):
         read_ptx(written(tmp_path, "version https://git-lfs.github.com/spec/v1\n"))

@@ -21,7 +21,8 @@ from hypothesis.extra import numpy as hnp
 
 from sfm_audit.loaders import LoadError
 from sfm_audit.loaders.scene_info.file import read_scene_info
-from sfm_audit.loaders.scene_info.inert_pickle import RefusedPickleError, load_inert
+from sfm_audit.loaders.scene_info.inert_pickle import load_inert
+from sfm_audit.loaders.scene_info.pickle_walk import RefusedPickleError
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 

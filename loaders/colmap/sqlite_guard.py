@@ -1,0 +1,88 @@
+"""A SQLite database that is read and not obeyed: plain tables only, bounded work, nothing of its schema is run.
+
+A database may be hostile: views without end, virtual tables, generated columns, functions in its schema, or blobs of
+gigabytes. Its schema is not trusted, an authorizer allows reading two tables and nothing else, and the number of steps
+of SQLite's machine is bounded by the size of the file.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Final
+
+TABLES: Final = {"images": ("image_id", "name"), "keypoints": ("image_id", "rows", "cols", "data")}
+"""What is read: columns by table."""
+
+_STEPS: Final = (10_000_000, 16)  # of SQLite's machine: this many, and so many per byte of the file
+_STEPS_PER_CALL: Final = 10_000
+_SETTINGS: Final = ("trusted_schema = OFF", "query_only = ON", "cell_size_check = ON", "mmap_size = 0")
+_MAX_COLUMNS: Final = 100
+
+
+def open_database(path: Path) -> sqlite3.Connection:
+    """Open a database for reading `TABLES` alone; nothing is written, not even a lock.
+
+    Raises
+    ------
+    sqlite3.Error
+        It is no database, or one of `TABLES` is no plain table with the columns needed.
+    """
+    size = path.stat().st_size
+    db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+    try:
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(min(size, 1_000_000_000), 100_000))
+        db.setlimit(sqlite3.SQLITE_LIMIT_COLUMN, _MAX_COLUMNS)
+        db.setlimit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 0)
+        for setting in _SETTINGS:
+            db.execute(f"PRAGMA {setting}")
+        budget = _Budget(_STEPS[0] + _STEPS[1] * size)
+        db.set_progress_handler(budget.spend, _STEPS_PER_CALL)
+        for table, columns in TABLES.items():
+            _check_table(db, table, columns)
+        db.set_authorizer(_allow_reading)
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
+class _Budget:
+    """Stops SQLite after a number of steps."""
+
+    def __init__(self, steps: int) -> None:
+        self._left = steps
+
+    def spend(self) -> int:
+        """Return 1, which interrupts the statement, when nothing is left."""
+        self._left -= _STEPS_PER_CALL
+        return int(self._left < 0)
+
+
+def _check_table(db: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> None:
+    """Raise unless ``table`` is a plain table (no view, nothing virtual) whose columns are stored (not generated)."""
+    kinds = db.execute("SELECT type, rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchall()
+    if not kinds:
+        raise sqlite3.DatabaseError(f"no such table: {table}")
+    if len(kinds) != 1 or kinds[0][0] != "table" or not kinds[0][1]:
+        raise sqlite3.DatabaseError(f"{table} is no plain table")
+    hidden = {row[1]: row[6] for row in db.execute(f"PRAGMA table_xinfo({table})")}
+    for column in columns:
+        if column not in hidden:
+            raise sqlite3.DatabaseError(f"no column {column} in table {table}")
+        if hidden[column]:
+            raise sqlite3.DatabaseError(f"column {column} of table {table} is generated")
+
+
+def _allow_reading(
+    action: int, table: str | None, column: str | None, _database: str | None, source: str | None
+) -> int:
+    """Allow SELECT from the columns of `TABLES`, asked by this program and not by a view or trigger."""
+    if source is not None:
+        return sqlite3.SQLITE_DENY
+    if action == sqlite3.SQLITE_SELECT:
+        return sqlite3.SQLITE_OK
+    known = (*TABLES.get(table or "", ()), "ROWID", "rowid", "")
+    if action == sqlite3.SQLITE_READ and table in TABLES and column in known:
+        return sqlite3.SQLITE_OK
+    return sqlite3.SQLITE_DENY

@@ -1,0 +1,98 @@
+"""The campaign of damaged inputs (scripts/fuzz.py), a few hundred of it, and that it sees what it looks for."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.fuzzing import workers
+from scripts.fuzzing.cases import MODELS, Case, file_case, model_case, write_case
+from scripts.fuzzing.edits import Edit
+from scripts.fuzzing.targets import TARGETS, Outcome, attempt
+from scripts.fuzzing.workers import Worker
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize(("target", "first"), [("models", 0), ("files", 10_000)])
+def test_some_of_a_campaign(target: str, first: int):
+    draw = TARGETS[target].draw
+    bad = [
+        (case, outcome)
+        for case in (draw(7, first + i) for i in range(250))
+        if not (outcome := attempt(target, case)).is_good
+    ]
+    assert bad == []
+
+
+def test_sound_inputs_are_sound():
+    for base in MODELS:
+        for layout in ("binary", "text"):
+            assert attempt("models", Case(0, base, layout, ())).kind == "ok", (base, layout)
+    for base in ("csv", "parquet", "ptx", "pickle2", "pickle4", "npz", "database"):
+        assert attempt("files", Case(0, base, "", ())).kind == "ok", base
+
+
+def test_an_input_is_the_same_every_time(tmp_path: Path):
+    for number, draw in enumerate([model_case, file_case] * 5):
+        assert draw(3, number) == draw(3, number)
+        contents = []
+        for copy in ("a", "b"):
+            folder = tmp_path / f"{number}{copy}"
+            folder.mkdir()
+            write_case(draw(3, number), folder)
+            contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+        assert contents[0] == contents[1]
+    assert len({model_case(3, number).edits for number in range(50)}) > 45
+
+
+def fill(_case: Case, _folder: Path) -> Outcome:
+    bytearray(8 << 30)
+    return Outcome("ok")
+
+
+def limited(pipe) -> None:
+    """What a worker does with an input that takes too much memory, in a process of its own."""
+    workers._prepare(1 << 30)
+    try:
+        fill(Case(0, "tiny", "binary", ()), Path())
+    except MemoryError:
+        pipe.send("MemoryError")
+
+
+def test_memory_is_limited():
+    here, there = workers._CONTEXT.Pipe()
+    process = workers._CONTEXT.Process(target=limited, args=(there,))
+    process.start()
+    assert here.poll(60)
+    assert here.recv() == "MemoryError"
+    process.join()
+
+
+def test_a_worker_that_dies_or_hangs_costs_its_input_alone():
+    worker = Worker(memory_bytes=1 << 30, seconds=20.0)
+    try:
+        assert worker.attempt("models", Case(0, "tiny", "binary", ())).kind == "ok"
+        worker._process.kill()
+        worker._process.join()
+        assert worker.attempt("models", Case(0, "tiny", "binary", ())).kind == "CRASH"
+        assert worker.attempt("models", Case(0, "tiny", "binary", ())).kind == "ok"
+        worker._seconds = 0.0
+        assert worker.attempt("models", Case(0, "tiny", "binary", ())).kind == "HANG"
+        worker._seconds = 20.0
+        cut = Case(0, "tiny", "binary", (Edit("cut", "images.bin", 5),))
+        assert worker.attempt("models", cut).kind == "refused"
+    finally:
+        worker.stop()
+
+
+def test_the_record_counts_pycolmap_s_answers_beside_ours(tmp_path: Path):
+    record = tmp_path / "record.json"
+    command = [sys.executable, ROOT / "scripts" / "fuzz.py", "--only", "4", "--target", "models", "--record", record]
+    assert subprocess.run(command, check=False, capture_output=True, timeout=120).returncode == 0
+    found = json.loads(record.read_text())
+    assert found["inputs"] == 1
+    assert sum(found["beside_pycolmap"].values()) == 1
+    assert found["failures"] == found["silent"] == []
