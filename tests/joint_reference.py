@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.joint import joint_system
-from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, project_image
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
 from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
 from sfm_audit.audit.simulate.noise import NoiseSpec
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene

@@ -13,7 +13,8 @@ import numpy as np
 
 from sfm_audit.audit.camera_quality.identifiability import ParameterCovariance, fitted_names
 from sfm_audit.audit.cameras import unproject
-from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.audit.inliers.projected import project_image
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import CameraRecord
 

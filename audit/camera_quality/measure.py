@@ -11,13 +11,13 @@ from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map, grid_rays, median_depth
 from sfm_audit.audit.camera_quality.identifiability import Identifiability, identifiability
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, camera_plausibility
+from sfm_audit.audit.inliers.projected import ImageInliers
 from sfm_audit.audit.misfit import (
     MisfitTests,
     candidate_fields,
     coincident_keypoints,
     nuisance_columns,
     prepare,
-    project_image,
 )
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import CameraRecord
@@ -58,34 +58,26 @@ class CameraQuality:
     occupied_cells: int
 
 
-def camera_quality(
-    shape: CameraShape,
-    xy_px: FloatArray,
-    xyz_cam: FloatArray,
-    residuals_px: FloatArray,
-    sigma_px: float,
-    *,
-    grid: int,
-) -> CameraQuality | None:
+def camera_quality(shape: CameraShape, inliers: ImageInliers, sigma_px: float, *, grid: int) -> CameraQuality | None:
     """Ask everything that needs the Jacobian of the image's own parameters, which is built once.
 
     Parameters
     ----------
-    shape : of the image's camera            xy_px : (n, 2) observed inliers          xyz_cam : (n, 3), camera frame
-    residuals_px : (2, n) observed - projected           sigma_px : sigma_constant_px         grid : of occupied_cells
+    shape : of the image's camera            inliers : of the image
+    sigma_px : sigma_constant_px             grid : of occupied_cells
 
     Returns
     -------
     CameraQuality
         None without inliers.
     """
-    if not len(xyz_cam):
+    if not len(inliers):
         return None
-    camera = shape.camera
-    projected = project_image(camera, xyz_cam)
+    camera, xy_px = shape.camera, inliers.xy_px
+    projected = inliers.projected
     columns = nuisance_columns(camera.model, projected)
     known = identifiability(camera, columns, sigma_px)
-    depth = median_depth(camera, xyz_cam)
+    depth = median_depth(camera, inliers.xyz_cam)
     error = math.nan
     if math.isfinite(sigma_px) and not known.parameters.is_singular:
         error = expected_error_map(camera, known.parameters, sigma_px, depth, rays=shape.rays).median_px
@@ -93,7 +85,7 @@ def camera_quality(
     prepared = prepare(columns, fields, clusters=coincident_keypoints(xy_px), overwrite_fields=True)
     return CameraQuality(
         shape,
-        prepared.test(residuals_px),
+        prepared.test(inliers.residuals_px),
         known,
         error,
         depth,

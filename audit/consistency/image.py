@@ -10,9 +10,10 @@ import numpy as np
 
 from sfm_audit.audit.consistency.affine import MEDIAN_LENGTH, AffineFit, fit_affine, median_of, root_mean_square
 from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation, affine_cause
-from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step, residuals_of
+from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step
 from sfm_audit.audit.consistency.readings import fitting_reading
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.inliers.residuals import image_residuals
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 
@@ -69,12 +70,72 @@ class ImageConsistency:
 def image_consistency(
     image: ImageRecord, xy_px: FloatArray, xyz_world: FloatArray, limits: ConsistencyLimits = DEFAULT_LIMITS
 ) -> ImageConsistency:
-    """Ask whether the parts of an image belong together.
+    """Ask whether the parts of an image without a model belong together; see `consistency_of_linked`.
 
     Parameters
     ----------
     image : pose and camera
     xy_px, xyz_world : (n, 2) px, (n, 3) model units: observations whose point exists, those behind the camera included
+    """
+    point_idx = np.arange(len(xyz_world))
+    part = image_residuals(image, xy_px, xyz_world, point_idx)
+    points = LinkedPoints(
+        image, xy_px, xyz_world, point_idx, part.inlier_row, part.residuals_px, part.num_behind, part.num_unprojected
+    )
+    return consistency_of_linked(points, limits)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkedPoints:
+    """The linked observations of an image, with what was left of them after projection.
+
+    xy_px: (n, 2) observed.    point_idx: (n,) rows of points_xyz (P, 3), world frame; -1 = dangling.
+    rows: (m,) those that are inliers (method.md section 1).    residuals_px: (2, m) of these.
+    num_behind, num_unprojected: how many others lie behind the camera, or in front without a finite projection.
+    """
+
+    image: ImageRecord
+    xy_px: FloatArray
+    points_xyz: FloatArray
+    point_idx: IntArray
+    rows: IntArray
+    residuals_px: FloatArray
+    num_behind: int
+    num_unprojected: int
+
+    @property
+    def camera(self) -> CameraRecord:
+        """The image's camera."""
+        if self.image.camera is None:
+            raise ValueError(f"image {self.image.image_id} has no camera")
+        return self.image.camera
+
+    @property
+    def num_finite(self) -> int:
+        """Observations whose numbers are finite, wherever their points lie."""
+        return self.rows.size + self.num_behind + self.num_unprojected
+
+    @property
+    def seen_px(self) -> FloatArray:
+        """(m, 2) observed."""
+        return self.xy_px.take(self.rows, axis=0)
+
+    @property
+    def seen_cam(self) -> FloatArray:
+        """(m, 3) points in the camera frame."""
+        return self.image.cam_from_world(self.points_xyz.take(self.point_idx[self.rows], axis=0))
+
+    def finite(self) -> tuple[FloatArray, FloatArray]:
+        """Return observed (k, 2) and world points (k, 3) of the observations whose numbers are finite."""
+        known = np.flatnonzero(self.point_idx >= 0)
+        xy_px, xyz_world = self.xy_px[known], self.points_xyz[self.point_idx[known]]
+        xyz_cam = self.image.cam_from_world(xyz_world)
+        finite = np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1)
+        return xy_px[finite], xyz_world[finite]
+
+
+def consistency_of_linked(points: LinkedPoints, limits: ConsistencyLimits = DEFAULT_LIMITS) -> ImageConsistency:
+    """Ask whether the parts of an image belong together.
 
     Notes
     -----
@@ -84,59 +145,27 @@ def image_consistency(
     are those of the model as it stands: the pose step would bend them. The step is taken only where the RMS exceeds a
     limit without it; elsewhere it decides nothing, and rms_px is stored_rms_px.
     """
-    camera = image.camera
+    image, camera = points.image, points.image.camera
     if camera is None or not np.isfinite(camera.params).all() or min(camera.width, camera.height) <= 0:
         return ImageConsistency(image.name, image.camera_id, 0, math.nan)
     with np.errstate(all="ignore"):
-        points = _linked_points(image, camera, xy_px, xyz_world)
         return _judged(points, limits)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _LinkedPoints:
-    """Observations of an image whose numbers are finite.
-
-    xy_px, xyz_world, xyz_cam: (n, 2), (n, 3), (n, 3).    in_front: (n,).
-    rows: (m,) those in front that project.               residuals_px: (2, m) of these.
-    """
-
-    image: ImageRecord
-    camera: CameraRecord
-    xy_px: FloatArray
-    xyz_world: FloatArray
-    xyz_cam: FloatArray
-    in_front: BoolArray
-    rows: IntArray
-    residuals_px: FloatArray
-
-
-def _linked_points(image: ImageRecord, camera: CameraRecord, xy_px: FloatArray, xyz_world: FloatArray) -> _LinkedPoints:
-    xyz_cam = image.cam_from_world(xyz_world)
-    finite = np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1)
-    xy_px, xyz_world, xyz_cam = xy_px[finite], xyz_world[finite], xyz_cam[finite]
-    in_front = (xyz_cam != 0).any(axis=1) if camera.model.is_spherical else xyz_cam[:, 2] > 0
-    rows = np.flatnonzero(in_front)
-    residuals = residuals_of(camera, xy_px[rows], xyz_cam[rows])
-    valid = np.isfinite(residuals).all(axis=0)
-    return _LinkedPoints(image, camera, xy_px, xyz_world, xyz_cam, in_front, rows[valid], residuals[:, valid])
-
-
-def _judged(points: _LinkedPoints, limits: ConsistencyLimits) -> ImageConsistency:
+def _judged(points: LinkedPoints, limits: ConsistencyLimits) -> ImageConsistency:
     """Measure, compare with the limits, and ask for the cause where one is exceeded."""
-    camera, num_linked = points.camera, len(points.xy_px)
-    share = float(points.in_front.mean()) if num_linked else math.nan
+    camera, num_linked = points.camera, points.num_finite
+    share = (num_linked - points.num_behind) / num_linked if num_linked else math.nan
     known = ImageConsistency(points.image.name, points.image.camera_id, num_linked, share)
     if num_linked < limits.min_observations:
         return known
     if points.rows.size >= limits.min_observations:
         length: FloatArray = np.hypot(*points.residuals_px)
-        projected = points.xy_px[points.rows].T - points.residuals_px
+        projected = points.seen_px.T - points.residuals_px
         affine = None if camera.model.is_spherical else fit_affine(projected, points.residuals_px)
         after: FloatArray | None = None
         if suspect := _exceeds(length, affine, camera, limits):
-            after = lengths_after_pose_step(
-                camera, points.xy_px[points.rows], points.xyz_cam[points.rows], points.residuals_px
-            )
+            after = lengths_after_pose_step(camera, points.seen_px, points.seen_cam, points.residuals_px)
         inconsistent = suspect and _exceeds(length if after is None else after, affine, camera, limits)
         known = replace(
             known,
@@ -186,7 +215,7 @@ def _half_pixel(affine: AffineFit | None, limits: ConsistencyLimits) -> int:
     return 0
 
 
-def _explained(known: ImageConsistency, points: _LinkedPoints, limits: ConsistencyLimits) -> Explanation:
+def _explained(known: ImageConsistency, points: LinkedPoints, limits: ConsistencyLimits) -> Explanation:
     """The cause, and the numbers that exceed their limits."""
     found = _cause(known, points, limits)
     share_limit, limit_px = limits.max_share_wrong, limits.max_rms_share * points.camera.width
@@ -204,7 +233,7 @@ def _explained(known: ImageConsistency, points: _LinkedPoints, limits: Consisten
     return replace(found, numbers=numbers)
 
 
-def _cause(known: ImageConsistency, points: _LinkedPoints, limits: ConsistencyLimits) -> Explanation:
+def _cause(known: ImageConsistency, points: LinkedPoints, limits: ConsistencyLimits) -> Explanation:
     """What explains the residuals: an affine map, wrong links, another reading of the pose, or a pose that moved."""
     affine, tolerance = known.affine, limits.max_rms_share * points.camera.width
     if affine is not None:
@@ -219,6 +248,6 @@ def _cause(known: ImageConsistency, points: _LinkedPoints, limits: ConsistencyLi
             return Explanation(Cause.LINKS, CAUSE_MEANINGS[Cause.LINKS])
     if known.moved:  # what explains it better than the pose's step has to leave much less
         tolerance = min(tolerance, known.rms_px / _MIN_BETTER)
-    read = fitting_reading(points.image, points.camera, points.xy_px, points.xyz_world, tolerance)
+    read = fitting_reading(points.image, points.camera, *points.finite(), tolerance)
     otherwise = Cause.POSES if known.moved else Cause.POSES_OR_POINTS
     return read or Explanation(otherwise, CAUSE_MEANINGS[otherwise])

@@ -11,7 +11,14 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
-from sfm_audit.audit.consistency.image import DEFAULT_LIMITS, ConsistencyLimits, ImageConsistency, image_consistency
+from sfm_audit.audit.consistency.image import (
+    DEFAULT_LIMITS,
+    ConsistencyLimits,
+    ImageConsistency,
+    LinkedPoints,
+    consistency_of_linked,
+)
+from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.loaders.arrays import BoolArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -59,19 +66,26 @@ class ModelConsistency:
         return any(finding.code is ConsistencyCode.PIXEL_CONVENTION for finding in self.findings)
 
 
-def consistency_of(model: SparseModel, limits: ConsistencyLimits = DEFAULT_LIMITS) -> ModelConsistency:
-    """Ask all images of a model, in file order, and the model."""
-    observations, xyz_world = model.observations, model.points.xyz_world
+def consistency_of(
+    model: SparseModel, residuals: ModelResiduals | None = None, limits: ConsistencyLimits = DEFAULT_LIMITS
+) -> ModelConsistency:
+    """Ask all images of a model, in file order, and the model; ``residuals`` of its inliers where they are at hand."""
+    residuals = model_residuals(model) if residuals is None else residuals
+    observations = model.observations
     images = []
     for image_idx in range(len(model.images)):
-        linked = slice(*observations.offsets[image_idx : image_idx + 2])
-        point_idx = observations.point_idx[linked]
-        known = np.flatnonzero(point_idx >= 0)
-        images.append(
-            image_consistency(
-                model.image(image_idx), observations.xy_px[linked][known], xyz_world[point_idx[known]], limits
-            )
+        linked, rows = slice(*observations.offsets[image_idx : image_idx + 2]), residuals.rows(image_idx)
+        points = LinkedPoints(
+            model.image(image_idx),
+            observations.xy_px[linked],
+            model.points.xyz_world,
+            observations.point_idx[linked],
+            residuals.observation_row[rows] - linked.start,
+            residuals.residuals_px[:, rows],
+            int(residuals.num_behind[image_idx]),
+            int(residuals.num_unprojected[image_idx]),
         )
+        images.append(consistency_of_linked(points, limits))
     return model_consistency(images, limits)
 
 

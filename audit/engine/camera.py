@@ -12,6 +12,7 @@ from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
+from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit import (
     ImageDesign,
@@ -20,8 +21,9 @@ from sfm_audit.audit.misfit import (
     Retest,
     advised_camera_model,
     camera_tests,
-    image_design,
     image_retest,
+    project_image,
+    projected_design,
 )
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.table.words import Member, Verdict
@@ -62,17 +64,15 @@ class _CameraImages:
         """Test as if the images had been taken with ``camera``."""
 
         def design(k: int) -> ImageDesign:
-            xyz_cam, residuals_px = self.geometry(k)
-            return image_design(camera, xyz_cam, residuals_px, tracks[k])
+            own = self.inliers(k)
+            projected = own.projected if camera is self.camera else project_image(camera, own.xyz_cam)
+            return projected_design(camera, projected, own.residuals_px, tracks[k])
 
         return camera_tests(design, len(self.image_idxs), num_tracks)
 
-    def geometry(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Inlier points (n, 3) in the camera frame and residuals (2, n) of the k-th image."""
-        image_idx = int(self.image_idxs[k])
-        rows = self.residuals.rows(image_idx)
-        xyz_world = self.model.points.xyz_world[self.residuals.point_idx[rows]]
-        return self.model.image(image_idx).cam_from_world(xyz_world), self.residuals.residuals_px[:, rows]
+    def inliers(self, k: int) -> ImageInliers:
+        """Inliers of the k-th image."""
+        return image_inliers(self.model, self.residuals, int(self.image_idxs[k]))
 
     def tracks(self) -> tuple[list[IntArray], int]:
         """Rows of each image's points in the list of this camera's points, and the length of that list."""
@@ -147,7 +147,8 @@ def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> 
 
     def retest(camera: CameraRecord) -> MisfitTests:
         if len(group.image_idxs) == 1:
-            return image_retest(*group.geometry(0))(camera)
+            own = group.inliers(0)
+            return image_retest(own.xyz_cam, own.residuals_px)(camera)
         return group.tests(camera, rows, num_points).tests
 
     return retest

@@ -23,6 +23,7 @@ from sfm_audit.audit.decision.diagnostics import (
 )
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import image_advice
+from sfm_audit.audit.inliers.projected import inliers_of
 from sfm_audit.audit.inliers.residuals import image_residuals
 from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
@@ -151,7 +152,8 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
     shape = None if camera is None else CameraShape.of(camera)
     quality, misfit = None, None
     if shape is not None:
-        quality = camera_quality(shape, kept.xy_px, part.xyz_cam.T, part.residuals_px, sigma_px, grid=config.grid)
+        own = inliers_of(inliers.image, inliers.xy_px, inliers.xyz_world, part)
+        quality = camera_quality(shape, own, sigma_px, grid=config.grid)
     if quality is not None:
         q = Significance.of([quality.misfit]).q[0]
         groups = misfit_groups(quality.misfit, q, num_observations=len(rows), sigma_px=sigma_px)

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from threadpoolctl import threadpool_limits
 
-from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, camera_quality
+from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
 from sfm_audit.audit.decision.decide import Decision
@@ -29,8 +29,10 @@ from sfm_audit.audit.engine.jointly import (
     untested_misfit,
 )
 from sfm_audit.audit.engine.observations import observation_table
+from sfm_audit.audit.engine.quality import quality_of_images
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
 from sfm_audit.audit.engine.tables import ModelAudit, images_table, table_of
+from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
@@ -143,7 +145,7 @@ class ModelAuditor:
     @cached_property
     def consistency(self) -> ModelConsistency:
         """Whether cameras, poses, points and 2D points belong together."""
-        return consistency_of(self.model)
+        return consistency_of(self.model, self.residuals)
 
     @cached_property
     def moved(self) -> BoolArray:
@@ -184,10 +186,6 @@ class ModelAuditor:
             holds=~self.moved & ~self.consistency.inconsistent,
         )
 
-    def _xyz_cam(self, image_idx: int) -> FloatArray:
-        point_idx = self.residuals.point_idx[self.residuals.rows(image_idx)]
-        return self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(point_idx, axis=0))
-
     def misfit(self, image_idx: int) -> MisfitDiagnostics | None:
         """The tests on which the verdict about the image in row ``image_idx`` rests; None without inliers."""
         if self.quality[image_idx] is None:
@@ -201,8 +199,8 @@ class ModelAuditor:
 
     def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
         """The misfit tests of the image if it had been fitted with this camera, to first order."""
-        residuals_px = self.residuals.residuals_px[:, self.residuals.rows(image_idx)]
-        return image_retest(self._xyz_cam(image_idx), residuals_px)(camera)
+        own = image_inliers(self.model, self.residuals, image_idx)
+        return image_retest(own.xyz_cam, own.residuals_px)(camera)
 
     def _shared_misfit(self, image_idx: int) -> SharedMisfit | None:
         """What the image's camera shows as a whole, if several images share it and together find a material misfit."""
@@ -372,28 +370,9 @@ def audit_model(
 
 
 def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality | None]:
-    """What some images say of their cameras; what depends on a camera alone is computed once for them."""
-    model, residuals = auditor.model, auditor.residuals
-    shapes: dict[int, CameraShape | None] = {}
-    out: list[CameraQuality | None] = []
-    for image_idx in image_idxs:
-        camera_idx = int(model.images.camera_idx[image_idx])
-        rows = residuals.rows(image_idx)
-        if rows.start == rows.stop:
-            out.append(None)
-            continue
-        if camera_idx not in shapes:
-            shapes[camera_idx] = CameraShape.of(model.camera(camera_idx))
-        shape = shapes[camera_idx]
-        if shape is None:
-            out.append(None)
-            continue
-        xy_px = model.observations.xy_px.take(residuals.observation_row[rows], axis=0)
-        xyz_cam = model.image(image_idx).cam_from_world(model.points.xyz_world.take(residuals.point_idx[rows], axis=0))
-        sigma_px = float(auditor.sigma_constant_px[image_idx])
-        own = residuals.residuals_px[:, rows]
-        out.append(camera_quality(shape, xy_px, xyz_cam, own, sigma_px, grid=auditor.config.grid))
-    return out
+    """What some images say of their cameras."""
+    sigma_px, grid = auditor.sigma_constant_px, auditor.config.grid
+    return quality_of_images(auditor.model, auditor.residuals, sigma_px, image_idxs, grid=grid)
 
 
 def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:

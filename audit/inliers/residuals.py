@@ -18,16 +18,20 @@ class ImageResiduals:
 
     inlier_row: (n,) their rows among the points given.          residuals_px: (2, n) observed - projected.
     jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (3, n).
+    d_extra: (e, 2, n) d projection / d distortion parameters, px per unit.
     num_dangling, num_behind, num_nonfinite: points that are no inliers, by cause.
+    num_unprojected: of num_nonfinite, those in front of the camera that have no finite projection.
     """
 
     inlier_row: IntArray
     residuals_px: FloatArray
     jacobian_cam: FloatArray
     xyz_cam: FloatArray
+    d_extra: FloatArray
     num_dangling: int
     num_behind: int
     num_nonfinite: int
+    num_unprojected: int
 
     @property
     def pose_offset_px(self) -> float:
@@ -42,7 +46,10 @@ class ModelResiduals:
     offsets: (I + 1,) image i owns columns offsets[i]:offsets[i + 1].    observation_row: (n,) rows of ObservationTable.
     point_idx: (n,) rows of PointTable.                                  residuals_px: (2, n) observed - projected.
     point_jacobian: (2, 3, n) px per model unit, world frame.            pose_offset_px: (I,) NaN without inliers.
+    d_extra: per image, (e, 2, n_i) d projection / d distortion parameters, px per unit. With them everything else that
+    a projection gives is cheap to have again: `audit.inliers.projected.image_inliers`.
     num_dangling, num_behind, num_nonfinite: (I,) linked observations that are no inliers, by cause.
+    num_unprojected: (I,) of num_nonfinite, those in front of their camera that have no finite projection.
     """
 
     offsets: IntArray
@@ -51,9 +58,11 @@ class ModelResiduals:
     residuals_px: FloatArray
     point_jacobian: FloatArray
     pose_offset_px: FloatArray
+    d_extra: tuple[FloatArray, ...]
     num_dangling: IntArray
     num_behind: IntArray
     num_nonfinite: IntArray
+    num_unprojected: IntArray
 
     def rows(self, image_idx: int) -> slice:
         """Columns of the image in row ``image_idx`` of the image table."""
@@ -86,29 +95,42 @@ def image_residuals(
         spherical = camera is not None and camera.model.is_spherical
         candidate = finite & ((xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0)
         num_behind = int(np.count_nonzero(finite)) - int(np.count_nonzero(candidate))
-        residuals, jacobian = np.empty((2, 0)), np.empty((2, 3, 0))
+        residuals, jacobian, d_extra = np.empty((2, 0)), np.empty((2, 3, 0)), np.empty((0, 2, 0))
         rows = np.flatnonzero(candidate)
         if camera is not None and rows.size:
             all_in = rows.size == linked.size
             xyz_cam = xyz_cam if all_in else xyz_cam[rows]
-            residuals, jacobian = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
+            residuals, jacobian, d_extra = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
         valid = np.isfinite(residuals).all(axis=0)
-    if not valid.all():
+    num_unprojected = valid.size - int(np.count_nonzero(valid))
+    if num_unprojected:
         rows, xyz_cam = rows[valid], xyz_cam[valid]
-        residuals, jacobian = residuals[:, valid], jacobian[:, :, valid]
-    num_nonfinite = linked.size - num_dangling - num_behind - rows.size
+        residuals, jacobian, d_extra = residuals[:, valid], jacobian[:, :, valid], d_extra[:, :, valid]
     return ImageResiduals(
-        rows, residuals, jacobian, xyz_cam.T if rows.size else np.empty((3, 0)), num_dangling, num_behind, num_nonfinite
+        rows,
+        residuals,
+        jacobian,
+        xyz_cam.T if rows.size else np.empty((3, 0)),
+        d_extra,
+        num_dangling,
+        num_behind,
+        linked.size - num_dangling - num_behind - rows.size,
+        num_unprojected,
     )
 
 
-def _residuals(camera: CameraRecord, xy_px: FloatArray, xyz_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Observed minus projected (2, n) and the Jacobian (2, 3, n) in the camera frame."""
-    projection = project_columns(camera.model, camera.params, xyz_cam, with_params=False)
+def _residuals(
+    camera: CameraRecord, xy_px: FloatArray, xyz_cam: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Observed minus projected (2, n), its Jacobians (2, 3, n) in the camera frame and (e, 2, n) in the distortion."""
+    extras = list(camera.model.extra_idxs)
+    projection = project_columns(camera.model, camera.params, xyz_cam, with_params=bool(extras))
+    d_params = projection.d_xy_d_params
+    d_extra = np.empty((0, 2, len(xyz_cam))) if d_params is None else d_params[extras]
     residuals = np.subtract(xy_px.T, projection.xy_px, order="C")
     if camera.model.is_spherical:
         residuals[0] -= camera.width * np.round(residuals[0] / camera.width)  # the seam is no edge
-    return residuals, projection.d_xy_d_cam
+    return residuals, projection.d_xy_d_cam, d_extra
 
 
 def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:
@@ -131,7 +153,8 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     residuals = np.empty((2, capacity))
     jacobian = np.empty((2, 3, capacity))
     pose_offset = np.full(num_images, np.nan)
-    counts = np.zeros((3, num_images), dtype=np.int64)
+    d_extra: list[FloatArray] = []
+    counts = np.zeros((4, num_images), dtype=np.int64)
     for image_idx in range(num_images):
         image, linked = model.image(image_idx), slice(*observations.offsets[image_idx : image_idx + 2])
         point_idx = observations.point_idx[linked]
@@ -142,7 +165,8 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         residuals[:, own] = part.residuals_px
         jacobian[:, :, own] = image.rotation_cam_from_world.T @ part.jacobian_cam
         pose_offset[image_idx] = part.pose_offset_px
-        counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite
+        d_extra.append(part.d_extra)
+        counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite, part.num_unprojected
     total = offsets[-1]
     observation_row = observation_row[:total]
     return ModelResiduals(
@@ -152,5 +176,6 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         residuals[:, :total],
         jacobian[:, :, :total],
         pose_offset,
+        tuple(d_extra),
         *counts,
     )

@@ -12,11 +12,11 @@ import numpy as np
 
 from sfm_audit.audit.cameras.functions import Term
 from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from sfm_audit.audit.joint.own import CameraStep
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
-from sfm_audit.audit.misfit.nuisance import ProjectedImage
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
@@ -94,7 +94,8 @@ def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> li
 
 def _missing_fields(system: JointSystem, image: int) -> ImageFields:
     """Six columns, px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
-    camera, projected = system.observations.project(image)
+    inliers = system.observations.inliers(image)
+    camera, projected = inliers.camera, inliers.projected
     fields = candidate_fields(camera, projected)
     out = np.zeros((6, *fields.shape[1:]))
     out[0, 0], out[1, 1] = 1.0, 1.0

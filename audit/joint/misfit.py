@@ -202,7 +202,8 @@ class _Rounds:
 
 def _fields_of(system: JointSystem, image: int) -> ImageFields:
     """42 candidate fields of an image, px per unit; none of panoramas."""
-    camera, projected = system.observations.project(image)
+    inliers = system.observations.inliers(image)
+    camera, projected = inliers.camera, inliers.projected
     fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
     return ImageFields(fields, system.observations.nuisance(image, projected))
 

@@ -7,11 +7,11 @@ from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.inliers.projected import ImageInliers, ProjectedImage, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
-from sfm_audit.audit.misfit.nuisance import ProjectedImage, project_image
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, SparseModel
+from sfm_audit.loaders.model import SparseModel
 
 MIN_INLIERS: Final = 20
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
@@ -76,17 +76,14 @@ class JointObservations:
         source = self.source[self.rows(image_idx)]
         return np.ascontiguousarray(self.residuals.point_jacobian.take(source, axis=2).transpose(2, 0, 1))
 
-    def project(self, image_idx: int) -> tuple[CameraRecord, ProjectedImage]:
-        """Camera of an image with columns and the projections of the points that it sees in the system."""
-        image = self.model.image(image_idx)
-        if image.camera is None:
-            raise ValueError(f"image {image.image_id} has columns but no camera")
-        points = self.residuals.point_idx[self.source[self.rows(image_idx)]]
-        return image.camera, project_image(image.camera, image.cam_from_world(self.model.points.xyz_world[points]))
+    def inliers(self, image_idx: int) -> ImageInliers:
+        """The observations of an image that are in the system."""
+        chosen = self.source[self.rows(image_idx)] - self.residuals.offsets[image_idx]
+        return image_inliers(self.model, self.residuals, image_idx, chosen)
 
     def nuisance(self, image_idx: int, projected: ProjectedImage | None = None) -> FloatArray:
         """N (n_i, 2, C) of an image, px per unit of its columns; zero in padding and where it is not finite."""
-        projected = self.project(image_idx)[1] if projected is None else projected
+        projected = self.inliers(image_idx).projected if projected is None else projected
         out = np.zeros((self.num_of(image_idx), 2, self.layout.width))
         out[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0)
         if self.layout.has_rigs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sfm_audit.audit.inliers.projected import ProjectedImage, project_image
 from sfm_audit.audit.misfit.cause import (
     Retest,
     advised_camera_model,
@@ -12,9 +13,9 @@ from sfm_audit.audit.misfit.cause import (
 )
 from sfm_audit.audit.misfit.clusters import coincident_keypoints
 from sfm_audit.audit.misfit.fields import candidate_fields
-from sfm_audit.audit.misfit.nuisance import ProjectedImage, fitted_param_idxs, nuisance_columns, project_image
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, nuisance_columns
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
-from sfm_audit.audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design
+from sfm_audit.audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design, projected_design
 from sfm_audit.audit.misfit.score import PreparedImage, prepare, prepare_image
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 
@@ -42,5 +43,6 @@ __all__ = [
     "prepare",
     "prepare_image",
     "project_image",
+    "projected_design",
     "remaining_groups",
 ]

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.misfit.nuisance import ProjectedImage
+from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import CameraRecord

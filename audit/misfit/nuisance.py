@@ -1,47 +1,12 @@
-"""What the image's own fit could have absorbed: projections and their Jacobians (method.md section 5's N)."""
+"""What the image's own fit could have absorbed (method.md section 5's N)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import cast
-
 import numpy as np
 
-from sfm_audit.audit.cameras import normalised, project_columns
-from sfm_audit.audit.inliers.stationarity import pose_columns
+from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
-from sfm_audit.loaders.model import CameraRecord
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectedImage:
-    """What a camera predicts for the n points of an image; no observed point ever enters.
-
-    Columns of Jacobians come first, then x and y, then points: (c, 2, n), contiguous.
-
-    xy_px: (2, n) predicted, distorted px.
-    u: (2, n) undistorted normalised point, fisheye models theta (X, Y) / rho; NaN for spherical models.
-    pose: (6, 2, n) px per rad and px per model unit, left perturbation in the camera frame.
-    d_params: (p, 2, n) px per unit of each parameter, in COLMAP's order.
-    """
-
-    xy_px: FloatArray
-    u: FloatArray
-    pose: FloatArray
-    d_params: FloatArray
-
-
-def project_image(camera: CameraRecord, xyz_cam: FloatArray) -> ProjectedImage:
-    """Project the points (n, 3), in the camera frame, of one image; values are NaN where a point does not project."""
-    xyz_cam = np.asfortranarray(xyz_cam)  # each coordinate contiguous
-    projection = project_columns(camera.model, camera.params, xyz_cam)
-    return ProjectedImage(
-        projection.xy_px,
-        np.ascontiguousarray(normalised(camera.model, camera.params, xyz_cam).T),
-        pose_columns(projection.d_xy_d_cam, xyz_cam.T),
-        cast("FloatArray", projection.d_xy_d_params),
-    )
 
 
 def fitted_param_idxs(model: CameraModel) -> tuple[int, ...]:

@@ -14,9 +14,10 @@ from typing import Final, Literal
 
 import numpy as np
 
+from sfm_audit.audit.inliers.projected import ProjectedImage, project_image
 from sfm_audit.audit.misfit import basis
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
-from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, project_image
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -59,7 +60,18 @@ def image_design(
     param_idxs: tuple[int, ...] | None = None,
 ) -> ImageDesign:
     """Return an image's part of the pooled test, from its points (n, 3) in the camera frame and residuals (2, n)."""
-    projected = project_image(camera, xyz_cam)
+    return projected_design(camera, project_image(camera, xyz_cam), residuals_px, track, param_idxs=param_idxs)
+
+
+def projected_design(
+    camera: CameraRecord,
+    projected: ProjectedImage,
+    residuals_px: FloatArray,
+    track: IntArray,
+    *,
+    param_idxs: tuple[int, ...] | None = None,
+) -> ImageDesign:
+    """Return an image's part of the pooled test, from what ``camera`` predicts for its points and residuals (2, n)."""
     chosen = fitted_param_idxs(camera.model) if param_idxs is None else param_idxs
     fields = candidate_fields(camera, projected)
     return ImageDesign(projected.pose, projected.d_params[list(chosen)], fields, residuals_px, track)

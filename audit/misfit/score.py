@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.misfit import basis
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
-from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests, judged_by_f, not_tested, refusal
 from sfm_audit.audit.table.words import MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray

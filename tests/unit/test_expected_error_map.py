@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from sfm_audit.audit.camera_quality.expected_error import cell_centres_px, expected_error_map, grid_rays, median_depth
 from sfm_audit.audit.camera_quality.identifiability import fitted_names, parameter_covariance
 from sfm_audit.audit.cameras import project
-from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.audit.inliers.projected import project_image
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.model import CameraRecord
 

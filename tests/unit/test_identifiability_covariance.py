@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.camera_quality.identifiability import fitted_names, identifiability, parameter_covariance
 from sfm_audit.audit.cameras import project
-from sfm_audit.audit.misfit.nuisance import nuisance_columns, project_image
+from sfm_audit.audit.inliers.projected import project_image
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
 from sfm_audit.loaders.model import CameraRecord
 

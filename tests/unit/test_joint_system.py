@@ -44,7 +44,8 @@ def reference(model):
 
 
 def fields_of(system, image):
-    camera, projected = system.observations.project(image)
+    inliers = system.observations.inliers(image)
+    camera, projected = inliers.camera, inliers.projected
     fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
     return ImageFields(fields, system.observations.nuisance(image, projected))
 
