@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map, grid_rays, median_depth
 from sfm_audit.audit.camera_quality.identifiability import Identifiability, identifiability
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, camera_plausibility
 from sfm_audit.audit.inliers.projected import ImageInliers
+from sfm_audit.audit.inliers.sanity import is_usable
 from sfm_audit.audit.misfit import (
     MisfitTests,
     candidate_fields,
@@ -36,8 +35,8 @@ class CameraShape:
 
     @classmethod
     def of(cls, camera: CameraRecord) -> CameraShape | None:
-        """Measure a camera; None where its parameters are not finite."""
-        if not np.isfinite(camera.params).all():
+        """Measure a camera; None where nothing can be projected with its parameters."""
+        if not is_usable(camera):
             return None
         return cls(camera, camera_plausibility(camera), grid_rays(camera))
 

@@ -13,6 +13,7 @@ from sfm_audit.audit.consistency.cause import CAUSE_MEANINGS, Cause, Explanation
 from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step
 from sfm_audit.audit.consistency.readings import fitting_reading
 from sfm_audit.audit.inliers.residuals import image_residuals
+from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
@@ -130,7 +131,7 @@ class LinkedPoints:
         known = np.flatnonzero(self.point_idx >= 0)
         xy_px, xyz_world = self.xy_px[known], self.points_xyz[self.point_idx[known]]
         xyz_cam = self.image.cam_from_world(xyz_world)
-        finite = np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1)
+        finite = is_sane(xyz_cam).all(axis=1) & is_sane(xy_px).all(axis=1)
         return xy_px[finite], xyz_world[finite]
 
 
@@ -146,7 +147,7 @@ def consistency_of_linked(points: LinkedPoints, limits: ConsistencyLimits = DEFA
     limit without it; elsewhere it decides nothing, and rms_px is stored_rms_px.
     """
     image, camera = points.image, points.image.camera
-    if camera is None or not np.isfinite(camera.params).all() or min(camera.width, camera.height) <= 0:
+    if camera is None or not is_usable(camera) or min(camera.width, camera.height) <= 0:
         return ImageConsistency(image.name, image.camera_id, 0, math.nan)
     with np.errstate(all="ignore"):
         return _judged(points, limits)

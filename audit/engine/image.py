@@ -25,6 +25,7 @@ from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import image_advice
 from sfm_audit.audit.inliers.projected import inliers_of
 from sfm_audit.audit.inliers.residuals import image_residuals
+from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
 from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
@@ -250,6 +251,11 @@ def _unusable(image: ImageRecord) -> Reason | None:
     num_odd = int(np.count_nonzero(~np.isfinite(params)))
     if num_odd:
         return _unusable_reason(ReasonCode.NON_FINITE_CAMERA, f"{num_odd} of {params.size} numbers", num_odd)
+    if not is_usable(image.camera):
+        values = ", ".join(f"{value:.4g}" for value in params)
+        return _unusable_reason(ReasonCode.EXTREME_VALUES, f"{image.camera.model.name} {values}", None)
+    if not is_sane(pose).all():
+        return _unusable_reason(ReasonCode.EXTREME_VALUES, f"pose, up to {np.abs(pose).max():.4g}", None)
     return None
 
 

@@ -364,7 +364,8 @@ def audit_model(
         Arrow tables; ``.images.to_pandas()`` for a data frame. Columns, units, meanings: docs/tables.md.
     """
     # Matrices are small here: a second BLAS thread only waits for the first, and on a busy machine that costs 10 x.
-    with threadpool_limits(limits=1, user_api="blas"):
+    # Odd numbers end as NaN and undetermined; what numpy says about them on the way is nothing for the terminal.
+    with threadpool_limits(limits=1, user_api="blas"), np.errstate(all="ignore"):
         auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread)
         return auditor.tables(labels, observations=observations)
 

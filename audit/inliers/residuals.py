@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
+from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_sane, is_usable
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel
@@ -83,15 +84,16 @@ def image_residuals(
     Notes
     -----
     method.md section 1: an observation enters if its point exists, Zc > 0 (spherical cameras: Xc != 0) and its
-    projection is finite. Observations that are themselves not finite count as not finite.
+    projection is finite. Observations that are themselves not finite count as not finite, and so does what is finite
+    and beyond arithmetic (`audit.inliers.sanity`).
     """
     linked = point_idx >= 0
     num_dangling = linked.size - int(np.count_nonzero(linked))
     camera = image.camera
     with np.errstate(all="ignore"):
         xyz_cam = image.cam_from_world(xyz_world)
-        usable = camera is not None and bool(np.isfinite(camera.params).all())
-        finite = linked & np.isfinite(xyz_cam).all(axis=1) & np.isfinite(xy_px).all(axis=1) & usable
+        usable = camera is not None and is_usable(camera)
+        finite = linked & is_sane(xyz_cam).all(axis=1) & is_sane(xy_px).all(axis=1) & usable
         spherical = camera is not None and camera.model.is_spherical
         candidate = finite & ((xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0)
         num_behind = int(np.count_nonzero(finite)) - int(np.count_nonzero(candidate))
@@ -101,7 +103,8 @@ def image_residuals(
             all_in = rows.size == linked.size
             xyz_cam = xyz_cam if all_in else xyz_cam[rows]
             residuals, jacobian, d_extra = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
-        valid = np.isfinite(residuals).all(axis=0)
+        valid = (np.abs(residuals) <= MAX_RESIDUAL_PX).all(axis=0)
+        valid &= is_sane(jacobian).all(axis=(0, 1)) | ~np.isfinite(jacobian).all(axis=(0, 1))  # poles of panoramas stay
     num_unprojected = valid.size - int(np.count_nonzero(valid))
     if num_unprojected:
         rows, xyz_cam = rows[valid], xyz_cam[valid]

@@ -59,6 +59,8 @@ def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: 
         columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
         gram = columns @ columns.T
     used = gram.diagonal() > 0
+    if not used.any():  # nothing that the pose does moves a point
+        return math.nan
     norms = np.sqrt(gram.diagonal()[used])
     y = residuals_px.reshape(2 * n)
     right = (columns @ y)[used] / norms

@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm_audit.audit.cameras import unproject
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.inliers.sanity import is_sane
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
@@ -68,7 +69,7 @@ def compare_stored_errors(model: SparseModel, residuals: ModelResiduals) -> Stor
     total = np.bincount(residuals.point_idx, weights=length, minlength=num_points)
     seen = count > 0
     recomputed = total[seen] / count[seen]
-    has_stored = stored_error_px >= 0
+    has_stored = (stored_error_px >= 0) & is_sane(stored_error_px)
     comparable = has_stored[seen]
     difference = np.abs(recomputed - stored_error_px[seen])[comparable]
     stale = (difference > _STALE_PX) & (difference > _STALE_SHARE_OF_ERROR * recomputed[comparable])

@@ -20,6 +20,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
+import numpy as np
+
 from sfm_audit.audit.engine.model import ModelAuditor, Spread, in_turn
 from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
 
@@ -71,7 +73,8 @@ def _gather(lanes: Lanes[int], num_processes: int, num_images: int, call: tuple[
 
 
 def _run_part(place: tuple[str, int], function: Callable[[Any, range], list[T]], start: int, stop: int) -> list[T]:
-    return function(_opened(*place), range(start, stop))
+    with np.errstate(all="ignore"):  # as `audit_model` does
+        return function(_opened(*place), range(start, stop))
 
 
 @lru_cache(maxsize=1)

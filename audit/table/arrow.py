@@ -42,7 +42,7 @@ def build_table(columns: Mapping[str, Values | Coded], wanted: pa.Schema) -> pa.
     Returns
     -------
     pa.Table
-        NaN (in float columns, not inside lists), None and masked values are null.
+        NaN and infinities (in float columns, not inside lists), None and masked values are null.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def _number_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
         if int(used.min()) != int(used.min().astype(dtype)) or int(used.max()) != int(used.max().astype(dtype)):
             raise ValueError(f"a value does not fit {kind}: {used.min()} .. {used.max()}")
     if dtype.kind == "f":
-        valid = valid & ~np.isnan(array.astype(dtype))
+        valid = valid & np.isfinite(array.astype(dtype))  # a table never holds an infinity
     data = _pack_bits(array.astype(bool)) if dtype.kind == "b" else _buffer(array.astype(dtype))
     return pa.Array.from_buffers(kind, len(array), [_validity(valid), data])
 

@@ -137,6 +137,7 @@ class ReasonCode(StrEnum):
     NON_FINITE_POSE = "non_finite_pose"
     NON_FINITE_CAMERA = "non_finite_camera"
     MISSING_CAMERA = "missing_camera"
+    EXTREME_VALUES = "extreme_values"
     EXACT_PROJECTIONS = "exact_projections"
     NOISE_NOT_FITTED = "noise_not_fitted"
     NON_FINITE_DERIVATIVES = "non_finite_derivatives"
@@ -210,6 +211,10 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
     ),
     ReasonCode.NON_FINITE_CAMERA: _leaves_open(
         "the camera parameters hold numbers that are not finite: how many", *_ALL
+    ),
+    ReasonCode.EXTREME_VALUES: _leaves_open(
+        "camera or pose hold finite numbers that nothing can be calculated with (above 1e12, or a focal length of 0)",
+        *_ALL,
     ),
     ReasonCode.MISSING_CAMERA: _leaves_open("the model has no camera of this id: the id", *_ALL),
     ReasonCode.EXACT_PROJECTIONS: _leaves_open(

@@ -48,6 +48,7 @@ _WORDS: Final = {
     "non_finite_pose": "the stored pose is no pose: {detail} are not finite",
     "non_finite_camera": "the stored camera is no camera: {detail} are not finite",
     "missing_camera": "the model does not hold its camera ({detail})",
+    "extreme_values": "the stored camera or pose holds numbers that nothing can be calculated with ({detail})",
     "exact_projections": "its 2D points are projections of the 3D points, not measurements ({detail})",
     "noise_not_fitted": "the noise could not be estimated ({detail})",
     "non_finite_derivatives": "the projection has no finite derivatives ({detail})",
