@@ -105,7 +105,7 @@ def test_the_ratio_of_error_and_deviation():
     assert focal_ratios(frame) == {"joint": 1.0, "conditional": 2.0}
 
 
-def test_what_the_readme_quotes_is_never_shortened():
+def test_counts_of_nought_are_never_shortened():
     """A share of the full study leaves out images of size and power, not of the verdicts' counts."""
 
     def counted(share):
