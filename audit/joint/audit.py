@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
 from sfm_audit.audit.joint.implied import ImpliedParameter, implied_parameters
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
@@ -89,9 +90,11 @@ def _of_block(
 ) -> tuple[Block, JointAudit]:
     steps = own_parameters(system)
     out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
-    for step in steps:
-        if step.is_material(float(np.median(tau_px[step.image_idxs]))):
-            out[step.image_idxs] = True
+    material = [step for step in steps if step.is_material(float(np.median(tau_px[step.image_idxs])))]
+    for step in material:
+        out[step.image_idxs] = True
+    settled = {step.camera_idx: step for step in implied_again(system, material)}
+    steps = tuple(settled.get(step.camera_idx, step) for step in steps)
     implied = implied_parameters(system, steps)
     core = np.flatnonzero(block.core).tolist()
     gains = [Gains(math.nan, math.nan, math.nan)] * len(block.core)

@@ -23,7 +23,8 @@ class CameraStep:
     camera_idx: row of CameraTable.    image_idxs: its images in the system.    num_observations: theirs.
     names: (q,) own parameters.    stored, step, sd: (q,) in their units. sd: sandwich clustered by track,
     NaN where the parameter is not identified.
-    implied: (q,) the values that the step speaks for: stored + step, but see `_implied_focal`.
+    implied: (q,) the values that the step speaks for: stored + step, but see `_implied_focal`; of a material step those
+    of `sfm_audit.audit.joint.again.implied_again`.
     plain_step: (q,) with w = 1: what a least-squares adjuster would do. Nothing should be rejected unless both agree.
     own_step_px: what freeing these parameters alone would gain, RMS px; plain_step_px: the same of ``plain_step``.
     sd_focal_rel: sd_f / |f|, of both focal lengths together where there are two (see `_sd_focal_rel`); NaN where one is

@@ -80,6 +80,7 @@ def _again(model: SparseModel, image_idx: int | None, advised: Mapping[int, str]
         num_rejected = int((tables.images.to_pandas()["verdict_misfit"] == "rejected").sum())
         return {
             "passes": auditor.cameras[0].misfit.material == (),
+            "accepted": bool((tables.images.to_pandas()["verdict"] == "accepted").all()),
             "converged": converged,
             "left_px": camera["misfit_px"],
             "others_rejected": num_rejected,
@@ -88,6 +89,7 @@ def _again(model: SparseModel, image_idx: int | None, advised: Mapping[int, str]
     others = tables.images.to_pandas().drop(index=image_idx)
     return {
         "passes": image["verdict_misfit"] == "accepted",
+        "accepted": image["verdict"] == "accepted",
         "converged": converged,
         "left_px": image["misfit_px"],
         "others_rejected": int((others["verdict_misfit"] == "rejected").sum()),
@@ -116,8 +118,11 @@ def with_models(model: SparseModel, advised: Mapping[int, str]) -> SparseModel:
     return dataclasses.replace(model, cameras=table)
 
 
-def refine(model: SparseModel) -> tuple[SparseModel, bool]:
-    """Bundle-adjust with pycolmap as COLMAP does by default, by way of files; and whether the solver converged."""
+def refine(model: SparseModel, *, cameras: bool = True) -> tuple[SparseModel, bool]:
+    """Bundle-adjust with pycolmap as COLMAP does by default, by way of files; and whether the solver converged.
+
+    cameras: whether their own parameters are free; poses and points always are.
+    """
     with tempfile.TemporaryDirectory() as folder:
         write_colmap_binary(model, Path(folder), np.random.default_rng(0))
         reconstruction = pycolmap.Reconstruction(folder)
@@ -128,6 +133,7 @@ def refine(model: SparseModel) -> tuple[SparseModel, bool]:
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.refine_principal_point = False
+        options.refine_focal_length = options.refine_extra_params = cameras
         solver = options.ceres.solver_options
         solver.num_threads = 1
         solver.max_num_iterations = _MAX_ITERATIONS

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import pandas as pd
 
 from scripts.validation.singles import EXACT_DEFECTS
@@ -19,6 +20,7 @@ Tables = dict[str, pd.DataFrame]
 LEVEL_TESTS: Final = ("ks_fitted", "dap", "sw")
 PLAIN_KS: Final = {NoiseKind.GAUSSIAN: 0.01, NoiseKind.PER_TRACK_LOGNORMAL: 0.05}
 _LARGE, _MATERIAL = "0.5 px", 0.5
+_NONE_OF_2520 = 0.0015  # upper end of Wilson's 95 % interval of 0 of 2520
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +50,14 @@ def all_checks(tables: Tables) -> list[Check | Within]:
         *_misfit_size(tables["singles"], "one camera per image, independent points"),
         *_misfit_size(_design(tables, "size"), "one camera per image, bundle-adjusted"),
         *_misfit_size(_design(tables, "size, shared camera"), "shared camera, tested singly", high=0.08),
+        *_misfit_size(_design(tables, "size"), "joint test", suffix="_p_joint", low=0.0),
         *_goodness_of_fit(_design(tables, "size")),
         *_power(tables["exact"]),
         *_effects(tables["exact"], tables["power"]),
         *_quarter(_design(tables, "quarter")),
         *_no_defects(tables["scenes"]),
+        *_focal_sd(tables["scenes"]),
+        *_frozen(tables["frozen"]),
         *_poses_and_corners(_design(tables, "poses and corners")),
         *_cameras(tables["cameras"]),
         *_advice(tables["advice"]),
@@ -80,15 +85,17 @@ def tested_share(part: pd.DataFrame, column: str) -> pd.Series | None:
     return p < ALPHA if 2 * len(p) > len(part) else None
 
 
-def _misfit_size(frame: pd.DataFrame, where: str, high: float = 0.07) -> Iterator[Check]:
+def _misfit_size(
+    frame: pd.DataFrame, where: str, *, suffix: str = "_p", low: float = 0.015, high: float = 0.07
+) -> Iterator[Check]:
     for noise, n, part in cells(frame):
         for group in GROUPS:
-            hits = tested_share(part, f"misfit_{group}_p")
+            hits = tested_share(part, f"misfit_{group}{suffix}")
             if hits is None:
                 continue
             cell = f"{group}, {noise}, n = {n}"
             if n >= 50:
-                yield check(f"size of the misfit groups from n = 50, {where}", cell, hits, 0.015, high)
+                yield check(f"size of the misfit groups from n = 50, {where}", cell, hits, low, high)
             else:
                 yield check(f"size of the misfit groups below n = 50, {where}", cell, hits, 0.0, 0.08)
 
@@ -148,9 +155,13 @@ def _quarter(frame: pd.DataFrame) -> Iterator[Check]:
     where = "a quarter of the images defective"
     rejected = frame["verdict_misfit"] == "rejected"
     sound = frame["kind"] == SOUND
-    yield check(f"sound images rejected by verdict_misfit, {where}", "all noises", rejected[sound], 0.0, 0.015)
+    claim = f"sound images rejected by verdict_misfit, {where}"
+    yield check(claim, "all noises", rejected[sound], 0.0, _NONE_OF_2520)
+    for name in ("verdict_camera", "verdict_pose", "policy_standard"):
+        hits = (frame[name] == "rejected")[sound]
+        yield check(f"sound images rejected by {name.replace('_', ' ')}, {where}", "all noises", hits, 0.0, 0.005)
     large = frame["true_px"] >= _MATERIAL
-    yield check(f"images of >= {_LARGE} systematic error rejected, {where}", "all noises", rejected[large], 0.95)
+    yield check(f"images of >= {_LARGE} systematic error rejected, {where}", "all noises", rejected[large], 0.96)
     found = frame[rejected & ~sound]
     right = pd.Series(
         [is_right(kind, name) for kind, name in zip(found["kind"], found["misfit_group"], strict=True)],
@@ -163,11 +174,52 @@ def _quarter(frame: pd.DataFrame) -> Iterator[Check]:
 
 
 def _no_defects(scenes: pd.DataFrame) -> Iterator[Check]:
-    part = scenes[scenes["design"].isin(["none", "size"]) & (scenes["n"] >= 100)]
+    part = sound_scenes(scenes)
     for noise in NoiseKind:
-        hits = part.loc[part["noise"] == str(noise), "policy_camera"] == "rejected"
-        if len(hits):
-            yield check("scenes without defects: rejected by policy camera", str(noise), hits, 0.0, 0.005)
+        own = part[part["noise"] == str(noise)]
+        for policy in ("standard", "camera") if len(own) else ():
+            hits = own[f"policy_{policy}"] == "rejected"
+            yield check(f"scenes without defects: rejected by policy {policy}", str(noise), hits, 0.0, 0.005)
+
+
+def focal_ratios(frame: pd.DataFrame) -> dict[str, float]:
+    """Return the RMS of (f - truth) / sd over images, sd of the joint system and conditional on the points."""
+    squares = {
+        name: (frame["focal_error_px"] / frame[column]) ** 2
+        for name, column in (("joint", "sd_focal_px"), ("conditional", "sd_focal_px_conditional"))
+    }
+    return {name: float(np.sqrt(ratio.mean())) for name, ratio in squares.items()}
+
+
+def sound_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
+    """Images of scenes without defects and 100 points or more, own cameras."""
+    return scenes[scenes["design"].isin(["none", "size"]) & (scenes["n"] >= 100)]
+
+
+def _focal_sd(scenes: pd.DataFrame) -> Iterator[Within]:
+    part = sound_scenes(scenes)
+    for noise in NoiseKind:
+        own = part[part["noise"] == str(noise)]
+        if len(own):
+            claim = "RMS of (f - truth) / sd, sd of f in the joint system, scenes without defects"
+            yield Within(claim, str(noise), focal_ratios(own)["joint"], 0.8, 1.8)
+
+
+def _frozen(frame: pd.DataFrame) -> Iterator[Check]:
+    guilty = frame["guilty"].astype(bool)
+    rejected = frame["verdict_camera"] == "rejected"
+    for case in frame["case"].unique():
+        own = frame["case"] == case
+        yield check("frozen parameters: guilty images rejected by verdict_camera", case, rejected[own & guilty], 1.0)
+        claim = "frozen parameters: other images of the model rejected by verdict_camera"
+        yield check(claim, case, rejected[own & ~guilty], 0.0, 0.0)
+        claim = "frozen parameters: other images of the model rejected by policy standard"
+        yield check(claim, case, (frame["policy_standard"] == "rejected")[own & ~guilty], 0.0, 0.005)
+        claim = "frozen parameters: any image rejected by verdict_misfit"
+        yield check(claim, case, (frame["verdict_misfit"] == "rejected")[own], 0.0, 0.005)
+        cameras = frame[own & guilty].drop_duplicates(["noise", "scene", "off_sd"])
+        right = cameras["implied_right"].astype(bool)
+        yield check("frozen parameters: implied value within 5 sd or 2 % of the truth", case, right, 0.95)
 
 
 def _poses_and_corners(frame: pd.DataFrame) -> Iterator[Check]:

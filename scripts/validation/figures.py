@@ -60,7 +60,7 @@ def draw_figures(tables: Tables, folder: Path, suffix: str = "svg") -> list[Path
             ("size", _misfit_size(plt, tables["singles"])),
             ("goodness_of_fit", _goodness_of_fit(plt, scenes[scenes["design"] == "size"])),
             ("power", _power(plt, tables["power"], quarter)),
-            ("peeling", _peeling(plt, quarter)),
+            ("joint", _joint(plt, quarter)),
             ("rules", _rules(plt, quarter)),
         ):
             paths.append(folder / f"validation_{name}.{suffix}")
@@ -160,13 +160,11 @@ def _binned(axis: Any, frame: pd.DataFrame, edges: np.ndarray, hits: pd.Series, 
     axis.plot(np.sqrt(edges[1:] * edges[:-1]), rates, **style)
 
 
-def _peeling(plt: Any, quarter: pd.DataFrame) -> Any:
+def _joint(plt: Any, quarter: pd.DataFrame) -> Any:
     figure, axes = plt.subplots(2, 2, figsize=(_WIDTH, 3.6), sharex=True, layout="constrained")
     sound = quarter["kind"] == SOUND
     edges = np.linspace(0.0, 1.2, 61)
-    for column, (name, title) in enumerate(
-        (("effect_before_px", "before peeling"), ("effect_after_px", "after peeling"))
-    ):
+    for column, (name, title) in enumerate((("effect_alone_px", "image by image"), ("effect_joint_px", "joint test"))):
         for row, (chosen, label, colour) in enumerate(
             ((sound, "correct cameras", _COLOURS[0]), (~sound, "wrong cameras", _COLOURS[1]))
         ):

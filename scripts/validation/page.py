@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from scripts.validation import words
+from scripts.validation import faults, words
 from scripts.validation.bounds import Tables, Within, cells, effect_ratio, tested_share
+from scripts.validation.faults import right_answer
+from scripts.validation.markdown import percent, table
 from scripts.validation.rules import rule_rows
 from scripts.validation.study import HOLDS, VIOLATED, WITHIN_CHANCE, Check
-from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, TAU_PX, is_right
+from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, TAU_PX
 from sfm_audit.audit.misfit import GROUPS
 from sfm_audit.audit.simulate.defects import DefectKind
 
-CLASSES: Final = ((0.2, 0.3), (0.3, 0.5), (0.5, np.inf))
 POWER_CLASSES: Final = ((0.03, 0.1), (0.1, 0.2), (0.2, 0.3), (0.3, 0.5), (0.5, 1.2))
-_BLAME_DESIGNS: Final = ("none", "quarter", "half", "quarter, 150 points", "quarter, short tracks")
-
-
-def percent(share: float) -> str:
-    """One decimal; a dash without trials."""
-    return "–" if np.isnan(share) else f"{100 * share:.1f} %"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, first column to the left, the others to the right; ValueError for a row of another width."""
-    rows = [*rows]
-    if any(len(row) != len(header) for row in rows):
-        raise ValueError(f"a row has not the {len(header)} columns of {', '.join(header)}")
-    lines = ["| " + " | ".join(header) + " |", "|---|" + "---:|" * (len(header) - 1)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> str:
@@ -44,7 +30,9 @@ def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> str
         _single_size(tables["singles"]),
         _scene_size(tables["scenes"]),
         _power(tables["power"], tables["exact"]),
-        _blame(tables["scenes"]),
+        faults.blame_section(tables["scenes"]),
+        faults.frozen_section(tables["frozen"]),
+        faults.focal_sd_section(tables["scenes"]),
         _poses(tables["scenes"]),
         _cameras(tables["cameras"]),
         _advice(tables["advice"]),
@@ -88,10 +76,10 @@ def _rate(part: pd.DataFrame, column: str) -> str:
     return "–" if hits is None else percent(float(hits.mean()))
 
 
-def _size_table(frame: pd.DataFrame, tests: Sequence[str], verdicts: Sequence[str]) -> str:
+def _size_table(frame: pd.DataFrame, tests: Sequence[str], verdicts: Sequence[str], suffix: str = "_p") -> str:
     rows = []
     for noise, n, part in cells(frame):
-        rates = [_rate(part, f"{test}_p") for test in tests]
+        rates = [_rate(part, f"{test}{suffix}") for test in tests]
         shares = [percent(float((part[verdict] == "rejected").mean())) for verdict in verdicts]
         rows.append((str(noise), str(n), str(len(part)), *rates, *shares))
     names = [test.removeprefix("misfit_").replace("_", " ") for test in tests]
@@ -99,6 +87,8 @@ def _size_table(frame: pd.DataFrame, tests: Sequence[str], verdicts: Sequence[st
 
 
 _MISFIT: Final = [f"misfit_{group}" for group in GROUPS]
+_POLICIES: Final = ("policy_standard", "policy_camera", "policy_full")
+_CAMERA_VERDICTS: Final = ("verdict_misfit", "verdict_camera", "verdict_pose")
 
 
 def _single_size(singles: pd.DataFrame) -> str:
@@ -113,7 +103,7 @@ def _single_size(singles: pd.DataFrame) -> str:
             _size_table(
                 singles,
                 ["ks", "ks_fitted", "ks_norm", "dap", "sw"],
-                ["verdict_ks", "policy_camera", "policy_full"],
+                ["verdict_ks", "policy_standard", "policy_camera", "policy_full"],
             ),
         ]
     )
@@ -148,21 +138,18 @@ def _scene_size(scenes: pd.DataFrame) -> str:
     return "\n\n".join(
         [
             words.SCENE_GOODNESS_OF_FIT,
-            _size_table(size, tests, ["verdict_ks", "policy_camera", "policy_full"]),
+            _size_table(size, tests, ["verdict_ks", "verdict_noise", *_POLICIES]),
             "![Size of the goodness-of-fit tests against n](figures/validation_goodness_of_fit.svg)",
             words.SCENE_MISFIT,
-            _size_table(size, _MISFIT, ["verdict_misfit", "verdict_pose", "plausible"]),
+            _size_table(size, _MISFIT, []),
+            words.SCENE_JOINT,
+            _size_table(size, _MISFIT, [*_CAMERA_VERDICTS, "plausible"], suffix="_p_joint"),
             words.SHARED_SIZE,
             _size_table(scenes[scenes["design"] == "size, shared camera"], _MISFIT, ["verdict_misfit"]),
             words.SCALES,
             table(("noise", "n", "raw", "predicted", "sigma_d", "sigma_l", "excess kurtosis", "nu0"), scales),
         ]
     )
-
-
-def _right_answer(frame: pd.DataFrame) -> pd.Series:
-    pairs = zip(frame["kind"], frame["misfit_group"], strict=True)
-    return pd.Series([is_right(kind, name) for kind, name in pairs], index=frame.index, dtype=bool)
 
 
 def _own_group_found(frame: pd.DataFrame) -> pd.Series:
@@ -185,7 +172,7 @@ def _power(power: pd.DataFrame, exact: pd.DataFrame) -> str:
                 shares = [
                     _own_group_found(part).mean(),
                     found.mean(),
-                    _right_answer(part)[found].mean(),
+                    right_answer(part)[found].mean(),
                     *((part[f"{test}_p"] < ALPHA).mean() for test in ("ks", "ks_fitted", "dap", "sw")),
                 ]
                 size = f"{low:g}–{high:g}"
@@ -228,60 +215,22 @@ def _effect_row(size: str, n: int, ratio: pd.Series) -> tuple[str, ...]:
     return (size, str(n), str(len(ratio)), *quantiles, percent(float(((ratio - 1.0).abs() <= 0.2).mean())))
 
 
-def _blame(scenes: pd.DataFrame) -> str:
-    rows, causes = [], []
-    for design in _BLAME_DESIGNS:
-        part = scenes[scenes["design"] == design]
-        if not len(part):
-            continue
-        sound = part["kind"] == SOUND
-        for when, column in (("before", "effect_before_px"), ("after", "effect_after_px")):
-            rejected = part[column] > TAU_PX
-            shares = [percent(float(rejected[part["true_px"].between(*limits)].mean())) for limits in CLASSES]
-            row = (percent(float(rejected[sound].mean())), *shares, percent(float(rejected[~sound].mean())))
-            rows.append((design, when, str(int(sound.sum())), str(int((~sound).sum())), *row))
-    quarter = scenes[scenes["design"] == "quarter"]
-    found = quarter[(quarter["verdict_misfit"] == "rejected") & (quarter["kind"] != SOUND)]
-    for kind in CAMERA_DEFECTS:
-        own = found[found["kind"] == str(kind)]
-        counts = [str(int((own["misfit_group"] == str(group)).sum())) for group in GROUPS]
-        causes.append((str(kind), str(len(own)), *counts, percent(float(_right_answer(own).mean()))))
-    noise_rows = []
-    for noise, _, part in cells(quarter):
-        sound = part["kind"] == SOUND
-        hit = part["verdict_misfit"] == "rejected"
-        large = part["true_px"] >= 0.5
-        shares = [percent(float(hit[chosen].mean())) for chosen in (sound, large, ~sound)]
-        noise_rows.append((str(noise), str(int(sound.sum())), str(int((~sound).sum())), *shares))
-    sizes = [f"{low:g}–{high:g} px" if high < np.inf else f"≥ {low:g} px" for low, high in CLASSES]
-    return "\n\n".join(
-        [
-            words.BLAME,
-            table(("scenes", "peeling", "sound", "wrong", "sound rejected", *sizes, "all wrong"), rows),
-            "![Effects before and after peeling](figures/validation_peeling.svg)",
-            words.CAUSES,
-            table(("planted", "rejected", *(str(group).replace("_", " ") for group in GROUPS), "right"), causes),
-            "By noise, a quarter wrong:",
-            table(("noise", "sound", "wrong", "sound rejected", "≥ 0.5 px rejected", "all wrong rejected"), noise_rows),
-        ]
-    )
-
-
 def _poses(scenes: pd.DataFrame) -> str:
     part = scenes[scenes["design"] == "poses and corners"]
     rows = []
     names = {SOUND: "sound", str(DefectKind.PERTURBED_POSE): "pose moved", str(DefectKind.FEW_POINTS): "corner only"}
     for kind, name in names.items():
         own = part[part["kind"] == kind]
-        shares = [(own[column] == "rejected").mean() for column in ("verdict_pose", "verdict_misfit", "verdict_ks")]
-        not_accepted = [(own[column] != "accepted").mean() for column in ("plausible", "policy_camera", "policy_full")]
+        verdicts = ("verdict_pose", "verdict_misfit", "verdict_camera", "verdict_noise", "verdict_ks")
+        shares = [(own[column] == "rejected").mean() for column in verdicts]
+        not_accepted = [(own[column] != "accepted").mean() for column in ("plausible", *_POLICIES)]
         offset = f"{own['pose_offset_px'].median():.3f}" if len(own) else "–"
         rows.append((name, str(len(own)), *(percent(float(s)) for s in (*shares, *not_accepted)), offset))
-    header = ("images", "number", "pose rejects", "misfit rejects", "ks rejects")
+    header = ("images", "number", "pose", "misfit", "camera", "noise", "ks", "not plausible")
     return "\n\n".join(
         [
             words.POSES,
-            table((*header, "not plausible", "policy camera", "policy full", "pose_offset_px"), rows),
+            table((*header, *(policy.replace("_", " ") for policy in _POLICIES), "pose_offset_px"), rows),
         ]
     )
 
@@ -312,8 +261,10 @@ def _advice(advice: pd.DataFrame) -> str:
         listed = ", ".join(f"{name} {count}" for name, count in named.items())
         tried = rejected["passes"].dropna().astype(bool)
         passes = percent(float(tried.mean())) if len(tried) else "–"
-        rows.append((str(design), str(kind), str(len(part)), str(len(rejected)), listed, str(len(tried)), passes))
-    header = ("scenes", "planted", "number", "rejected", "advice", "refitted", "pass afterwards")
+        whole = percent(float(rejected["accepted"].dropna().astype(bool).mean())) if len(tried) else "–"
+        numbers = (str(len(part)), str(len(rejected)), listed, str(len(tried)))
+        rows.append((str(design), str(kind), *numbers, passes, whole))
+    header = ("scenes", "planted", "number", "rejected", "advice", "refitted", "pass afterwards", "policy standard")
     return "\n\n".join(
         [
             words.ADVICE,

@@ -9,9 +9,9 @@ import pandas as pd
 
 from scripts.validation.truth import ALPHA, SOUND
 
-OURS: Final = ("verdict_misfit", "policy_camera", "policy_full")
+OURS: Final = ("verdict_misfit", "policy_standard", "policy_camera", "policy_full")
 SCORES: Final = {
-    "effect_after_px": "misfit effect after peeling",
+    "effect_joint_px": "misfit effect, joint test",
     "rms_px": "RMS",
     "biasedness_8": "biasedness, 8 x 8 cells",
 }
@@ -30,7 +30,7 @@ def rules(frame: pd.DataFrame) -> list[Rule]:
     """Return the rules' decisions on the images of ``frame``."""
     out = [Rule(f"{name.replace('_', ' ')} (ours)", "", frame[name] == "rejected") for name in OURS]
     out += [
-        Rule("KS, track noise model (ours)", "5 %", frame["ks_p"] < ALPHA),
+        Rule("KS, track noise model (policy paper)", "5 %", frame["policy_paper"] == "rejected"),
         Rule("KS, constant noise (the paper's rule)", "5 %", frame["ks_constant_p"] < ALPHA),
         Rule("KS with Lilliefors' null, constant noise", "5 %", frame["ks_fitted_constant_p"] < ALPHA),
         Rule("RMS", "1 px", frame["rms_px"] > 1.0),

@@ -6,16 +6,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from scripts.validation.rivals import rival_columns
 from scripts.validation.truth import CAMERA_DEFECTS, SOUND, noise_of
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.misfit import GROUPS
+from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.simulate.adjust import AdjustmentError, adjust_scene, sparse_model
 from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
 from sfm_audit.audit.simulate.noise import NoiseKind
 from sfm_audit.audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
+from sfm_audit.audit.table.words import POLICIES, Member, verdict_under
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import SparseModel
 
 IMAGES_PER_SCENE = 40
@@ -30,8 +34,10 @@ KEPT = (
     *("sigma_constant_px", "sigma_d_px", "sigma_l", "sigma_predicted_px", "kurtosis_excess"),
     *(f"{test}_p" for test in ("ks", "ks_fitted", "ks_norm", "dap", "sw", "ks_constant", "ks_fitted_constant")),
     *(f"misfit_{group}_{what}" for group in GROUPS for what in ("p", "px")),
-    *("misfit_group", "misfit_px", "advised_camera_model", "pose_offset_px"),
-    *("verdict_ks", "verdict_misfit", "verdict_pose", "plausible"),
+    *(f"misfit_{group}_{what}_joint" for group in GROUPS for what in ("px", "q")),
+    *("misfit_group", "misfit_px", "misfit_worth_deg", "misfit_worth_focal_rel", "severity"),
+    *("advised_camera_model", "pose_offset_px", "own_step_px", "sd_focal_px", "sd_focal_px_conditional"),
+    *("verdict_ks", "verdict_misfit", "verdict_camera", "verdict_pose", "plausible", "verdict_noise"),
 )
 
 
@@ -97,6 +103,12 @@ def simulate(design: Design, scene_idx: int, seed: int) -> tuple[SimulatedScene,
     raise AdjustmentError(f"{design.name}, scene {scene_idx}: {_MAX_DRAWS} scenes could not be adjusted")
 
 
+def policy_columns(images: pa.Table) -> dict[str, list[str]]:
+    """Return what each policy says of every image of an image table."""
+    members = images.select([str(member) for member in Member]).to_pylist()
+    return {f"policy_{policy}": [str(verdict_under(policy, row)) for row in members] for policy in POLICIES}
+
+
 def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     """Audit one scene; a row per image."""
     scene, model, num_failed = simulate(design, scene_idx, seed)
@@ -111,22 +123,32 @@ def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     frame["num_failed"] = num_failed
     frame["noise_nu0"] = tables.models["noise_nu0"][0].as_py()
     frame["shared_reason"] = [any(text.startswith("shared_camera") for text in texts) for texts in images["reasons"]]
-    frame["most_are_wrong"] = auditor.blame.most_are_wrong
-    alpha = auditor.config.alpha
-    frame["effect_before_px"] = auditor.blame.significance.effect_px(alpha)
-    frame["effect_after_px"] = auditor.blame.final.effect_px(alpha)
-    frame["policy_full"] = images["verdict"]
-    members = images[["verdict_misfit", "verdict_pose", "plausible"]]
-    frame["policy_camera"] = np.where(
-        (members == "rejected").any(axis=1),
-        "rejected",
-        np.where((members == "undetermined").any(axis=1), "undetermined", "accepted"),
-    )
+    for name, values in {**_joint_columns(auditor), **policy_columns(tables.images)}.items():
+        frame[name] = values
+    frame["effect_alone_px"] = _effect_alone_px(auditor)
+    stored = model.cameras.params[model.cameras.param_offsets[model.images.camera_idx]]
+    frame["focal_error_px"] = stored - scene.claimed_params[:, 0]
     kinds, sizes = [SOUND] * len(images), [0.0] * len(images)
     for defect in scene.defects:
         kinds[defect.image_idx], sizes[defect.image_idx] = str(defect.kind), defect.systematic_px or 0.0
     frame["kind"], frame["true_px"] = kinds, sizes
     return pd.concat([frame, rival_columns(auditor)], axis=1)
+
+
+def _joint_columns(auditor: ModelAuditor) -> dict[str, FloatArray]:
+    """Return the p of every group in the joint test, and each image's largest significant effect."""
+    joint = auditor.joint
+    if joint is None:
+        raise ValueError("a scene whose parts do not belong together")
+    tests = joint.misfit.tests
+    p = {f"misfit_{group}_p_joint": np.array([image[group].p for image in tests]) for group in GROUPS}
+    return {**p, "effect_joint_px": joint.misfit.effect_px}
+
+
+def _effect_alone_px(auditor: ModelAuditor) -> FloatArray:
+    """Return the largest significant effect of each image (I,), 0 without any, image by image as the model stands."""
+    found = Significance.of([UNTESTED if each is None else each.misfit for each in auditor.quality])
+    return np.asarray(np.where(found.q < auditor.config.alpha, found.px, 0.0).max(axis=1))
 
 
 def audit_shared_camera(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:

@@ -21,7 +21,7 @@ from sfm_audit.audit.simulate.defects import (
 )
 from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec, draw_noise
 from sfm_audit.audit.simulate.truth import TrueCameras, claimed_params_of, project_true, true_model_of
-from sfm_audit.audit.table.words import Member
+from sfm_audit.audit.table.words import POLICIES, Member
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet
@@ -34,7 +34,13 @@ NORMALITY = ("ks", "ks_fitted", "ks_norm", "dap", "sw")
 EXACT_DEFECTS = {DefectKind.RADIAL_K2: (0.05,), DefectKind.TANGENTIAL: (1e-3, 1e-3)}
 _SEED_SIZE, _SEED_POWER, _SEED_EXACT = 1, 2, 3
 _MAX_STEPS, _STEP_TOLERANCE_PX = 20, 1e-7
-MEMBERS = {"ks": Member.KS, "misfit": Member.MISFIT, "pose": Member.POSE, "plausible": Member.PLAUSIBLE}
+MEMBERS = {
+    "ks": Member.KS,
+    "misfit": Member.MISFIT,
+    "pose": Member.POSE,
+    "plausible": Member.PLAUSIBLE,
+    "noise": Member.NOISE,
+}
 
 
 def sound_camera() -> TrueCameras:
@@ -91,8 +97,8 @@ def row_of(audit: ImageAudit) -> dict[str, object]:
     row["misfit_group"] = audit.misfit.group
     for name, member in MEMBERS.items():
         row[f"verdict_{name}"] = str(audit.decision.of(member))
-    row["policy_camera"] = str(audit.decision.under("camera").verdict)
-    row["policy_full"] = str(audit.decision.under("full").verdict)
+    for policy in POLICIES:
+        row[f"policy_{policy}"] = str(audit.decision.under(policy).verdict)
     return row
 
 

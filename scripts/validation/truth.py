@@ -11,6 +11,7 @@ from sfm_audit.audit.simulate.noise import NoiseKind, NoiseSpec
 SIGMA_PX: Final = 0.5
 ALPHA: Final = 0.05
 TAU_PX: Final = 0.2
+SCENE_FOCAL_PX: Final = 1000.0  # of the median camera of a scene
 CAMERA_DEFECTS: Final = (
     DefectKind.RADIAL_K2,
     DefectKind.RADIAL_K3,

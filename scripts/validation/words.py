@@ -31,8 +31,8 @@ image is audited as `--points independent` under the `constant` noise model.
 
 *Scenes*: 40 images on a jittered grid, own camera each unless said otherwise, tracks of 3 to 15 images, about n points
 per image. Poses, points, f and k1 are bundle-adjusted with pycolmap to convergence, then the model is audited with the
-defaults (`track` noise model, tau = {tau} px). Scenes that did not reach an optimum, because an image with few points
-in a corner drifts, were drawn again: {redrawn}.
+defaults (`track` noise model, policy `standard`, tau = {tau} px). Scenes that did not reach an optimum, because an
+image with few points in a corner drifts, were drawn again: {redrawn}.
 
 *Defects* have a random direction and a systematic size: the RMS length in px of what remains of the noise-free
 displacement after the image's own pose, f and k1 were refitted to the true points. Of six kinds in turn: k2, k3,
@@ -68,7 +68,11 @@ Goodness of fit under the `track` noise model (`ks constant`: under `constant`),
 because pose, camera and scale were fitted. The `track` model is meant for noise that belongs to the track; noise that
 is drawn per observation from heavy tails it cannot know, and the shape tests say so."""
 
-SCENE_MISFIT: Final = "Misfit groups on the same images, as the model stands, and the verdicts on the camera."
+SCENE_MISFIT: Final = "Misfit groups on the same images, image by image as the model stands (`misfit_<group>_p`)."
+
+SCENE_JOINT: Final = """\
+The same in the joint test, where points, poses and the parameters of all other cameras are free too, and the verdicts,
+which rest on it. Conservative below 250 points: what an image says about its own lens is then mostly spent on them."""
 
 SHARED_SIZE: Final = "The same where all images share one camera and are tested singly (250 points)."
 
@@ -91,18 +95,44 @@ of a small effect is less than that. {word}"""
 BLAME: Final = """\
 ## Whose fault: scenes with wrong cameras among correct ones
 
-Images rejected for misfit (q < 5 %, effect above tau) before and after peeling, by true size; seven noise kinds in
-equal parts. *150 points*: instead of 400 per image. *short tracks*: 3 or 4 images."""
+Images with a significant effect (q < 5 %) above tau, by true size; seven noise kinds in equal parts. *alone*: each
+image tested as the model stands, with the points as they are: shared points carry a wrong image's field into its
+neighbours, and hide a part of it. *joint*: what neither points nor poses nor any camera's own parameters could take
+up, wrong images freed one after the other (sequential inclusion); `verdict_misfit` rests on that. *150 points*:
+instead of 400 per image. *short tracks*: 3 or 4 images."""
 
 CAUSES: Final = """\
 Named causes of the rejected images, a quarter wrong (tangential and principal point count as one answer, and affine as
 an answer to rolling shutter):"""
 
+SEVERITY: Final = """\
+What the rejected images' misfits are worth: the change of the image's rotation and focal length (medians) if the misfit
+were admitted, and the severity that follows. *effect / truth*: of the joint test."""
+
+FROZEN: Final = """\
+## Parameters that were wrong and never freed
+
+Scenes of 24 images with 400 points, all seven noise kinds, two scenes each. Everything is adjusted, then parameters
+are set wrong (f by 8 %, k1 by 0.04, up and down in turn; distortion at least 0.03 in k1), then poses and points are
+adjusted with all cameras fixed: what an imported calibration leaves. *guilty*, *others*: images whose camera is, is
+not wrong. *camera*, *misfit*, *standard*: rejected by that verdict or policy. *own_step_px*: median of the guilty,
+largest of the others. *named*: the parameter that the reason names, per camera. *worst*: of the implied values of all
+wrong parameters, in sd; *right*: cameras whose implied values are within 5 sd or 2 % of the truth."""
+
+FOCAL_SD: Final = """\
+## How well is a focal length known?
+
+Scenes without defects: root mean square of (f - truth) / sd over images, 1 wanted. *joint*: sd of the joint system,
+with points, poses and all cameras free (`sd_focal_px`); *conditional on the points* (`sd_focal_px_conditional`)
+pretends that points are known. Adjustment was plain least squares, while the joint system weighs outliers down: hence
+more than 1 where tails are heavy."""
+
 POSES: Final = """\
 ## Poses moved after the adjustment, and images that see a corner only
 
 Per scene of 40 images four poses moved by 1 to 3 px RMS after bundle adjustment, and four images left with 8 to 24
-points in one corner. *not*: rejected or undetermined. Last column: median."""
+points in one corner. Rejected by each verdict; not plausible and the policies: rejected or undetermined. Last column:
+median."""
 
 CAMERAS: Final = """\
 ## One camera for all images
@@ -114,10 +144,11 @@ that verdict_misfit rejects, and that are told that the camera as a whole is at 
 ADVICE: Final = """\
 ## Does the advised camera model fit?
 
-Scenes of 20 images with one defective image (300 points per image, 0.2 to 1.2 px), or with one shared camera that lacks
-k2 = 0.02 or 0.05 (150 points per image). The camera is switched to the advised model, new parameters 0, refined with
-all else by pycolmap, and audited again; it passes if verdict_misfit accepts the image (shared: if no group of the
-camera is material). *none: ...* is advice that no model would help. Images that were not rejected get no advice."""
+Scenes of 20 images with one defective image (300 points per image, 0.2 to 1.2 px), or with one shared camera that
+lacks k2 = 0.02 or 0.05 (150 points per image). The camera is switched to the advised model, new parameters 0, refined
+with all else by pycolmap, and audited again; it passes if verdict_misfit accepts the image (shared: if no group of the
+camera is material); *policy standard*: accepted by all members (shared: all images). *none: ...* is advice that no
+model would help. Images that were not rejected get no advice."""
 
 RULES: Final = """\
 ## Rules in use elsewhere, on the same images

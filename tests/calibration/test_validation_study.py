@@ -11,8 +11,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from scripts.validation.advice import advise_one, refine, with_models
-from scripts.validation.bounds import all_checks
+from scripts.validation.bounds import all_checks, focal_ratios
+from scripts.validation.frozen import Frozen, audit_frozen
 from scripts.validation.page import document
+from scripts.validation.plan import full_plan
 from scripts.validation.rivals import biasedness
 from scripts.validation.rules import best_threshold
 from scripts.validation.scenes import Design, audit_images, audit_shared_camera, simulate
@@ -32,6 +34,7 @@ TINY = [
     Task("scenes", audit_images, (Design("quarter", 3, n=60, share=0.25, scene=SMALL), 0, 1), 2.0),
     Task("scenes", audit_images, (Design("poses and corners", 7, n=90, num_poses=2, num_corners=2), 0, 1), 3.0),
     Task("cameras", audit_shared_camera, (Design("shared", 9, n=60, shared_k2=0.05, scene=SMALL), 0, 1)),
+    Task("frozen", audit_frozen, (Frozen.TWO_K1, NoiseKind.GAUSSIAN, 0, 1)),
     Task("advice", advise_one, (Design("one image", 10, n=90, share=0.05, scene=SMALL), 0, 1)),
 ]
 
@@ -56,7 +59,7 @@ def test_one_and_two_processes_give_the_same_page():
     page = document(one, all_checks(one), 1)
     assert page == document(two, all_checks(two), 1)
     assert "nan" not in page
-    assert page.count("\n## ") == 11
+    assert page.count("\n## ") == 13
 
 
 def test_single_images_are_fitted():
@@ -94,6 +97,27 @@ def test_biasedness():
 def test_the_best_threshold_separates():
     frame = pd.DataFrame({"kind": ["none"] * 3 + ["aspect"] * 3, "x": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]})
     assert best_threshold(frame, "x") == 3.0
+
+
+def test_the_ratio_of_error_and_deviation():
+    sds = {"sd_focal_px": [1.0, 2.0], "sd_focal_px_conditional": [0.5, 1.0]}
+    frame = pd.DataFrame({"focal_error_px": [1.0, -2.0], **sds})
+    assert focal_ratios(frame) == {"joint": 1.0, "conditional": 2.0}
+
+
+def test_counts_of_nought_are_never_shortened():
+    """A share of the full study leaves out images of size and power, not of the verdicts' counts."""
+
+    def counted(share):
+        names = [task.args[0].name if task.part == "scenes" else task.part for task in full_plan(1, share)]
+        return {name: names.count(name) for name in ("quarter", "poses and corners", "frozen", "singles", "size")}
+
+    whole, part = counted(1.0), counted(0.25)
+    assert (whole["quarter"], whole["poses and corners"]) == (84, 42)
+    for name in ("quarter", "poses and corners", "frozen"):
+        assert whole[name] == part[name]
+    assert part["singles"] == whole["singles"] / 4
+    assert part["size"] < whole["size"] / 2
 
 
 def test_the_page_is_the_script_s():
