@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
+
+_MAX_PART: Final = 600  # characters of a part of a message; names in files may be as long as the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +40,14 @@ class LoadError(Exception):
         self.advice = advice
 
     def __str__(self) -> str:
-        """One line, whatever the parts contain."""
+        """One line of bounded length, whatever the parts contain."""
         where = f"{self.path}: {self.position}" if self.position else self.path
-        return " ".join(f"{where}: expected {self.wanted}, found {self.got}; {self.advice}".split())
+        wanted, got, advice = (_bounded(part) for part in (self.wanted, self.got, self.advice))
+        return " ".join(f"{where}: expected {wanted}, found {got}; {advice}".split())
+
+
+def _bounded(part: str) -> str:
+    return part if len(part) <= _MAX_PART else f"{part[:_MAX_PART]}..."
 
 
 class MissingFileError(LoadError):

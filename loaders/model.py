@@ -78,7 +78,7 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.NON_FINITE_POINTS: "3D points that are not finite; their projections count as num_nonfinite",
     FindingCode.NON_FINITE_CAMERAS: "cameras with parameters that are not finite; their images are undetermined",
     FindingCode.NON_FINITE_OBSERVATIONS: "linked 2D points that are not finite",
-    FindingCode.NON_FINITE_UNUSED: "unlinked 2D points, colours or replaced poses that are not finite; not used here",
+    FindingCode.NON_FINITE_UNUSED: "unlinked 2D points, colours or replaced poses that are no numbers; not used here",
     FindingCode.OBSERVATIONS_OUTSIDE: "linked 2D points outside of their image",
     FindingCode.IMAGE_SIZE_SWAPPED: "cameras whose principal point says that width and height are swapped",
     FindingCode.DUPLICATE_NAMES: "images that share their name with another one",

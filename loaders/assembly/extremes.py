@@ -94,7 +94,7 @@ def unused_nonfinite(raw: RawModel, poses: FloatArray) -> tuple[Finding, ...]:
     parts = [f"{count} {what}" for what, count in counts.items() if count]
     if not parts:
         return ()
-    text = f"{', '.join(parts)} are not finite; they are not used here"
+    text = f"{', '.join(parts)} are no numbers that COLMAP reads in text; they are not used here"
     return (Finding(FindingCode.NON_FINITE_UNUSED, sum(counts.values()), text),)
 
 

@@ -51,7 +51,7 @@ class RawPoints:
 
     track_lengths: (P,). track_image_id, track_point2d_idx: (T,), the tracks one after the other.
     has_tracks: False for a format that stores no tracks: there is then nothing to compare the images' links with.
-    num_unused_nonfinite: points whose colour is not finite, which only text can say.
+    num_unused_nonfinite: points whose colour is no whole number, which only text can say.
     """
 
     point3d_id: UInt64Array

@@ -109,7 +109,8 @@ def _not_there(images: RawImages, frames: Sequence[RawFrame]) -> tuple[Finding, 
 def _sensors_disagree(raw: RawModel, rigs: Sequence[RawRig], frames: Sequence[RawFrame]) -> tuple[Finding, ...]:
     """Compare what rigs, frames, cameras and images say of each other; COLMAP refuses a model where they disagree.
 
-    The camera of an image is the one that the images file names.
+    The camera of an image is the one that the images file names; what keeps an image from being placed is another
+    finding, see `_not_placed`.
     """
     known = set(raw.cameras.camera_id.tolist())
     sensors_of = {rig.rig_id: rig.sensor_from_rig for rig in rigs}
@@ -123,10 +124,14 @@ def _sensors_disagree(raw: RawModel, rigs: Sequence[RawRig], frames: Sequence[Ra
     for frame in frames:
         sensors = sensors_of.get(frame.rig_id)
         if sensors is None:
+            if camera_of.keys() & set(frame.image_ids):
+                continue  # its images are not placed, which is said already
             problems.append(f"frame {frame.frame_id} is of rig {frame.rig_id}, which does not exist")
             continue
         for image_id, sensor_id in zip(frame.image_ids, frame.sensor_ids, strict=True):
             camera_id = camera_of.get(image_id, sensor_id)
+            if camera_of.get(image_id) == sensor_id:
+                continue  # they agree; whether the rig has it is said already
             if (CAMERA_SENSOR, sensor_id) not in sensors:
                 where = f"frame {frame.frame_id} has image {image_id} of camera {sensor_id}"
                 problems.append(f"{where}, which is not in rig {frame.rig_id}")

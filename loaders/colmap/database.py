@@ -195,7 +195,7 @@ def _keypoints_of(
         rows, cols, data = _asked(path, lambda: db.execute(query, (row,)).fetchone())
     where = f"keypoints of image {image_id} ({name!r})"
     if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols in {2, 4, 6}):
-        raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r} rows and {cols!r} columns")
+        raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r:.40} rows and {cols!r:.40} columns")
     data = data or b""
     if not isinstance(data, bytes) or len(data) != rows * cols * 4:
         got = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__

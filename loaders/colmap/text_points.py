@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, UInt32Array, UInt64Array
 from sfm_audit.loaders.assembly.raw import RawPoints, offsets_of, order_of_points
 from sfm_audit.loaders.errors import LoadError, Position
 from sfm_audit.loaders.paths.text_lines import TextFile, is_number, parse_uint, repr_token
@@ -49,7 +49,7 @@ def read_points(file: TextFile) -> RawPoints:
         track_lengths=np.concatenate([batch.track_lengths for batch in batches]),
         track_image_id=tracks[:, 0].copy(),
         track_point2d_idx=tracks[:, 1].copy(),
-        num_unused_nonfinite=int(np.count_nonzero(~np.isfinite(fixed[:, 4:7]).all(axis=1))),
+        num_unused_nonfinite=int(np.count_nonzero(~_are_colours(fixed[:, 4:7]))),
     )
 
 
@@ -77,6 +77,12 @@ def _read_batch(file: TextFile, numbered: list[tuple[int, bytes]]) -> _Batch:
         exact_ids = np.array(exact, dtype=np.uint64)
     fixed = values[at < _NUM_FIXED].reshape(-1, _NUM_FIXED)
     return _Batch(exact_ids, fixed, tracks.astype(np.uint32).reshape(-1, 2), (lengths - _NUM_FIXED) // 2)
+
+
+def _are_colours(rgb: FloatArray) -> BoolArray:
+    """Whether colours (p, 3) are whole numbers that COLMAP can read, (p,); they are not used here."""
+    result: BoolArray = np.all((np.abs(rgb) < 2.0**31) & (rgb == np.floor(rgb)), axis=1)
+    return result
 
 
 def _are_ids(values: FloatArray, bound: float) -> bool:

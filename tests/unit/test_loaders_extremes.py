@@ -115,3 +115,24 @@ def test_rigs_and_frames_that_name_what_does_not_exist(tmp_path: Path):
 
 def test_a_sound_rig_has_no_such_finding(tmp_path: Path):
     assert open_model(write_binary(tmp_path, rig_model())).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        (b" 1 2 3 0.75 ", b" 1 nan 3 0.75 ", "1 colours"),
+        (b" 1 2 3 0.75 ", b" 1 9223372036854775808 3 0.75 ", "1 colours"),
+        (b" 1 2 3 0.75 ", b" 1 2.5 3 0.75 ", "1 colours"),
+        (b"30.0 40.0 -1", b"inf 40.0 -1", "1 unlinked 2D points"),
+        (b"\n90 1.0 ", b"\n90 nan ", "1 poses that rigs and frames replace"),
+    ],
+)
+def test_text_that_colmap_refuses_where_nothing_is_read_from_is_told(tmp_path: Path, old: bytes, new: bytes, what: str):
+    """pycolmap 4.1: "Check failed: line_stream >> ..." for each of them."""
+    write_text(tmp_path, rig_model())
+    for name in ("images.txt", "points3D.txt"):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content.replace(old, new, 1))
+    (finding,) = open_model(tmp_path).findings
+    assert finding.code == FindingCode.NON_FINITE_UNUSED
+    assert what in finding.text
