@@ -192,7 +192,10 @@ def _keypoints_of(
     rows, cols, data = 0, 2, b""
     if row is not None:  # else the image has no row in the table of keypoints
         query = "SELECT rows, cols, data FROM keypoints WHERE rowid = ?"
-        rows, cols, data = _asked(path, lambda: db.execute(query, (row,)).fetchone())
+        stored = _asked(path, lambda: db.execute(query, (row,)).fetchone())
+        if stored is None:  # a damaged table: a walk finds the row, a search does not
+            raise _malformed(path, f"the keypoints of image {image_id} ({name!r}) in row {row}", "no such row")
+        rows, cols, data = stored
     where = f"keypoints of image {image_id} ({name!r})"
     if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols in {2, 4, 6}):
         raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r:.40} rows and {cols!r:.40} columns")

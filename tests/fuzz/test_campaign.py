@@ -96,3 +96,9 @@ def test_the_record_counts_pycolmap_s_answers_beside_ours(tmp_path: Path):
     assert found["inputs"] == 1
     assert sum(found["beside_pycolmap"].values()) == 1
     assert found["failures"] == found["silent"] == []
+
+
+def test_a_row_that_a_search_does_not_find_is_told():
+    """Number 1177 of seed 21: a page of the table of keypoints points elsewhere."""
+    case = Case(1177, "database", "", (Edit("put", "database", 18534, "ffffffff00000000"),))
+    assert attempt("files", case).kind == "refused"
