@@ -27,6 +27,7 @@ _NEVER_NULL: Final[Mapping[str, frozenset[str]]] = {
     "cameras": frozenset({*_LABELS, "camera_id", "num_images"}),
     "models": frozenset({*_LABELS, "num_images", "num_accepted", "num_rejected", "num_undetermined"}),
 }
+_ALWAYS_SAID: Final = frozenset({"code", "text"})  # of a finding, of a reason
 _TYPES: Final = {table: {column.name: column.type for column in columns} for table, columns in TABLES.items()}
 
 
@@ -143,13 +144,17 @@ def _check_own_words(part: pq.ParquetFile, table: str, model: ModelRecord) -> No
 
 
 def _has_null_elements(values: pa.Array[Any]) -> bool:
-    """Whether a list of texts or of records, such as reasons and findings, has an element or a field that is null."""
+    """Whether a list of texts or of records (reasons, findings) has a null element, or one without code or text."""
     if not pa.types.is_list(values.type) or pa.types.is_floating(values.type.value_type):
         return False
     elements = values.flatten()  # type: ignore[attr-defined]
     if elements.null_count:
         return True
-    return pa.types.is_struct(elements.type) and any(field.null_count for field in elements.flatten())
+    if not pa.types.is_struct(elements.type):
+        return False
+    names = [elements.type.field(i).name for i in range(elements.type.num_fields)]
+    fields = zip(names, elements.flatten(), strict=True)
+    return any(name in _ALWAYS_SAID and field.null_count for name, field in fields)
 
 
 def _size(file: io.BufferedReader) -> int:
