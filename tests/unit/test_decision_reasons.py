@@ -150,7 +150,6 @@ def judged(diagnostics, member, **settings):
         ),
         (camera(coverage=0.1), M.PLAUSIBLE, "low_coverage: 10.0% < 20% of the image"),
         (camera(occupied_cells=3), M.PLAUSIBLE, "few_occupied_cells: 3 < 16"),
-        (camera(coverage=0.1), M.PLAUSIBLE, "low_coverage: 10.0% < 20% of the image"),
         (
             camera(k1=0.001, sd_k1=0.002, is_joint=False),
             M.PLAUSIBLE,
