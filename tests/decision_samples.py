@@ -104,5 +104,9 @@ def parts(**changes) -> Diagnostics:
     return sound(consistency=replace(FITS, **changes))
 
 
-def worth(deg=0.1, focal=0.005) -> Worth:
-    return Worth(deg, 0.01, focal)
+def worth(deg=0.1, focal=0.005, centre=0.01) -> Worth:
+    return Worth(deg, centre, focal)
+
+
+def worth_misfit(name="radial", **changes) -> Diagnostics:
+    return with_misfit(**{name: replace(MATERIAL, worth=worth(**changes))})

@@ -16,7 +16,6 @@ from decision_samples import (
     NOT_TESTED,
     OWN,
     camera,
-    group,
     misfit,
     moved,
     noise,
@@ -24,6 +23,8 @@ from decision_samples import (
     parts,
     sound,
     with_misfit,
+    worth,
+    worth_misfit,
 )
 
 from sfm_audit.audit.config import AuditConfig
@@ -87,6 +88,16 @@ def judged(diagnostics, member, **settings):
             with_misfit(**{**dict.fromkeys(GROUPS, NOT_TESTED), "radial": ABSORBED}),
             M.MISFIT,
             f"misfit_not_tested: {', '.join(f'{g} (not enough evidence)' for g in GROUPS[1:])}",
+        ),
+        (
+            worth_misfit("smooth", deg=0.0123, focal=-0.0005, centre=0.002),
+            M.MISFIT,
+            "misfit_without_worth: smooth 0.30 px, worth 0.012 degrees, 0.002 of the depth, -0.0005 of f",
+        ),
+        (
+            worth_misfit("smooth", deg=0.0123, focal=NAN, centre=0.002),
+            M.MISFIT,
+            "misfit_without_worth: smooth 0.30 px, worth 0.012 degrees, 0.002 of the depth",
         ),
         (with_misfit(radial=MATERIAL), M.MISFIT, "misfit_radial: 0.30 px, q = 0.01"),
         (parts(inconsistent=True, text="scale 1000", rms_px=88.0), M.CAMERA, "inconsistent: scale 1000"),
@@ -173,6 +184,7 @@ NUMBERS = [
     (noise(ks_stat=0.2), M.NOISE, (pytest.approx(0.2 - 1.36 / math.sqrt(580)), 0.03, "1", None)),
     (with_misfit(affine=MATERIAL), M.MISFIT, (0.3, 0.2, "px", G.AFFINE)),
     (with_misfit(affine=MATERIAL, shared=SHARED), M.MISFIT, (0.41, 0.2, "px", G.TANGENTIAL)),
+    (worth_misfit("smooth", deg=0.0, focal=0.0), M.MISFIT, (0.3, 0.2, "px", G.SMOOTH)),
     (with_misfit(smooth=NOT_TESTED), M.MISFIT, (None, None, "", None)),
     (parts(inconsistent=True, rms_px=88.0), M.CAMERA, (88.0, None, "px", None)),
     (own(step_px=0.43), M.CAMERA, (0.43, 0.2, "px", None)),
@@ -243,6 +255,13 @@ def test_a_shared_camera_is_named_beside_a_rejection_and_only_there():
     assert (unknown.verdict, len(unknown.reasons)) == (UNDETERMINED, 1)
 
 
+def test_a_misfit_without_worth_is_a_remark_beside_what_could_not_be_tested():
+    cheap = replace(MATERIAL, worth=worth(deg=0.0, focal=0.0))
+    judgement = judged(with_misfit(radial=cheap, smooth=NOT_TESTED, shared=SHARED), M.MISFIT)
+    assert judgement.verdict == ACCEPTED
+    assert [reason.code for reason in judgement.reasons] == [C.MISFIT_WITHOUT_WORTH, C.MISFIT_NOT_TESTED]
+
+
 def test_the_camera_names_the_parameter_that_moves_most_of_its_deviations():
     steps = (moved(6.0), moved(-9.0, "k1"), moved(8.0, "k2"))
     judgement = judged(sound(own=replace(OWN, step_px=0.3, steps=steps)), M.CAMERA)
@@ -310,53 +329,6 @@ def test_an_unusable_image_is_undetermined_in_every_question_that_is_asked(behin
     assert set(decision.members) == set(M) - {M.OUTSIDE}
     for member, judgement in decision.members.items():
         assert (judgement.verdict, judgement.reasons) == (UNDETERMINED, (replace(why, member=member),))
-
-
-# the cause of a misfit
-
-
-def test_the_cause_pays_most_among_the_material_groups():
-    found = with_misfit(
-        radial=group(q=0.01, px=0.3, gain=5.0),
-        rolling_shutter=group(q=0.02, px=0.25, gain=9.0),
-        smooth=group(q=0.001, px=0.19, gain=50.0),  # not material
-        affine=group(q=0.06, px=0.9, gain=99.0),  # not significant
-    )
-    decision = decide(found, AuditConfig())
-    assert decision.misfit.group is G.ROLLING_SHUTTER
-    assert (decision.misfit.px, decision.misfit.q, decision.misfit.tau_px) == (0.25, 0.02, 0.2)
-    assert decision.misfit.material == (G.RADIAL, G.ROLLING_SHUTTER)
-    assert decision.misfit.also == ((G.RADIAL, 0.3),)
-    assert decision.misfit.untested == ()
-    text = "misfit_rolling_shutter: 0.25 px, q = 0.02 (also radial 0.30 px)"
-    assert str(decision.members[M.MISFIT].reasons[0]) == text
-
-
-def test_a_cause_below_tau_is_named_and_rejects_nothing():
-    found = with_misfit(radial=group(q=0.01, px=0.1, gain=5.0), smooth=group(q=0.01, px=0.15, gain=1.0))
-    decision = decide(found, AuditConfig())
-    assert (decision.misfit.group, decision.misfit.px, decision.misfit.material) == (G.RADIAL, 0.1, ())
-    assert decision.of(M.MISFIT) == ACCEPTED
-
-
-def test_no_significant_group_has_no_cause():
-    decision = decide(with_misfit(smooth=NOT_TESTED, radial=ABSORBED), AuditConfig())
-    assert decision.misfit.group is None
-    assert math.isnan(decision.misfit.px)
-    assert math.isnan(decision.misfit.q)
-    assert decision.misfit.tau_px == 0.2
-    assert decision.misfit.untested == ((G.SMOOTH, NOT_TESTED.status),)
-    assert (decision.misfit.material, decision.misfit.also) == ((), ())
-
-
-def test_only_a_tested_group_can_be_the_cause():
-    odd = replace(NOT_TESTED, q=0.001, gain=99.0)  # no test has a q without being tested; the cause rests on the status
-    decision = decide(with_misfit(radial=group(q=0.01, px=0.1), smooth=odd), AuditConfig())
-    assert decision.misfit.group is G.RADIAL
-
-
-def test_nothing_tested_has_no_decision_about_misfit():
-    assert decide(sound(misfit=None), AuditConfig()).misfit is None
 
 
 # words

@@ -5,7 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from decision_samples import MATERIAL, NAN, SOUND, camera, group, noise, own, parts, sound, with_misfit, worth
+from decision_samples import (
+    MATERIAL,
+    NAN,
+    SOUND,
+    camera,
+    group,
+    noise,
+    own,
+    parts,
+    sound,
+    with_misfit,
+    worth,
+    worth_misfit,
+)
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import decide
@@ -16,8 +29,9 @@ from sfm_audit.audit.table.words import SEVERITY_ORDER, Member, Severity, Verdic
 HARD, MEDIUM, WEAK = Severity.HARD, Severity.MEDIUM, Severity.WEAK
 
 
-def worth_misfit(**changes):
-    return with_misfit(radial=replace(MATERIAL, worth=worth(**changes)))
+def shift(**changes):
+    """A principal point is rejected by the shift of the centre, whatever it turns the image by."""
+    return worth_misfit("principal_point", **changes)
 
 
 @pytest.mark.parametrize(
@@ -37,16 +51,16 @@ def worth_misfit(**changes):
         (worth_misfit(deg=0.2001), HARD),
         (worth_misfit(focal=0.01001), HARD),
         (worth_misfit(focal=-0.01001), HARD),
-        (worth_misfit(deg=0.0199, focal=0.00099), WEAK),
-        (worth_misfit(deg=0.0199, focal=-0.00099), WEAK),
-        (worth_misfit(deg=0.02, focal=0.0), MEDIUM),
-        (worth_misfit(deg=0.0, focal=0.001), MEDIUM),
-        (worth_misfit(deg=0.0, focal=-0.001), MEDIUM),
-        (worth_misfit(deg=0.0199, focal=NAN), WEAK),
+        (shift(deg=0.0199, focal=0.00099), WEAK),
+        (shift(deg=0.0199, focal=-0.00099), WEAK),
+        (shift(deg=0.02, focal=0.0), MEDIUM),
+        (shift(deg=0.0, focal=0.001), MEDIUM),
+        (shift(deg=0.0, focal=-0.001), MEDIUM),
+        (shift(deg=0.0199, focal=NAN), WEAK),
         (worth_misfit(deg=0.2001, focal=NAN), HARD),
-        (replace(worth_misfit(deg=0.0, focal=0.0), noise=noise(ks_stat=0.2).noise), WEAK),
+        (replace(shift(deg=0.0, focal=0.0), noise=noise(ks_stat=0.2).noise), WEAK),
         (replace(worth_misfit(deg=0.1), noise=noise(ks_stat=0.2).noise), MEDIUM),
-        (replace(worth_misfit(deg=0.0, focal=0.0), pose_offset_px=2.0), HARD),
+        (replace(shift(deg=0.0, focal=0.0), pose_offset_px=2.0), HARD),
     ],
 )
 def test_the_severity_of_a_rejection(diagnostics, severity):
@@ -66,7 +80,7 @@ def test_a_witness_outside_is_hard():
 def test_the_worth_is_that_of_the_named_cause():
     found = with_misfit(
         radial=group(q=0.01, px=0.3, gain=1.0, worth=worth(deg=9.0)),
-        smooth=group(q=0.01, px=0.3, gain=2.0, worth=worth(deg=0.001, focal=0.0)),
+        tangential=group(q=0.01, px=0.3, gain=2.0, worth=worth(deg=0.001, focal=0.0)),
     )
     decision = decide(found, AuditConfig())
     assert worth_of(decision.misfit, found.misfit).rotation_deg == 0.001

@@ -31,14 +31,25 @@ from decision_samples import (
     parts,
     sound,
     with_misfit,
+    worth_misfit,
 )
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import decide
-from sfm_audit.audit.table.words import GROUPS, POLICIES, Member, ReasonCode, Verdict, strongest, verdict_under
+from sfm_audit.audit.table.words import (
+    GROUPS,
+    POLICIES,
+    Member,
+    MisfitGroup,
+    ReasonCode,
+    Verdict,
+    strongest,
+    verdict_under,
+)
 
 ACCEPTED, REJECTED, UNDETERMINED = Verdict.ACCEPTED, Verdict.REJECTED, Verdict.UNDETERMINED
 C, M = ReasonCode, Member
+SHIFTS = (MisfitGroup.TANGENTIAL, MisfitGroup.PRINCIPAL_POINT)
 HALF = 0.5**0.5  # RMS of half a pixel in x and in y
 BELOW, ABOVE = (1.36 / math.sqrt(580) + 0.03 + side for side in (-1e-6, 1e-6))  # D of 290 observations
 ASKS_FOR_MEASUREMENTS = (M.MISFIT, M.CAMERA, M.NOISE, M.KS)
@@ -110,6 +121,29 @@ TABLE = [
     (M.MISFIT, with_misfit(**dict.fromkeys(LENS, ABSORBED)), {}, UNDETERMINED, [C.MISFIT_NOT_TESTED]),
     (M.MISFIT, with_misfit(**dict.fromkeys(GROUPS, EXCLUDED)), {}, UNDETERMINED, [C.MISFIT_NOT_TESTED]),
     *((M.MISFIT, with_misfit(**{g: MATERIAL}), {}, REJECTED, [C(f"misfit_{g}")]) for g in GROUPS),
+    # verdict_misfit: what it is worth; not known is enough. A shift is not measured by the rotation that takes it up
+    *(
+        (M.MISFIT, worth_misfit(g, deg=0.0199, focal=0.00099, centre=9.0), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH])
+        for g in GROUPS
+        if g not in SHIFTS
+    ),
+    (M.MISFIT, worth_misfit(deg=0.02, focal=0.0), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worth_misfit(deg=0.0, focal=0.001), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worth_misfit(deg=0.0, focal=-0.001), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worth_misfit(deg=0.0, focal=-0.00099), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
+    (M.MISFIT, worth_misfit(deg=0.0199, focal=NAN), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
+    (M.MISFIT, worth_misfit(deg=0.02, focal=NAN), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worth_misfit(deg=NAN, focal=0.0, centre=0.0), {}, REJECTED, [C.MISFIT_RADIAL]),
+    *(
+        row
+        for g in SHIFTS
+        for row in (
+            (M.MISFIT, worth_misfit(g, deg=9.0, focal=0.00299, centre=0.00099), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
+            (M.MISFIT, worth_misfit(g, deg=0.0, focal=0.00299, centre=0.001), {}, REJECTED, [C(f"misfit_{g}")]),
+            (M.MISFIT, worth_misfit(g, deg=0.0, focal=0.003, centre=0.00099), {}, REJECTED, [C(f"misfit_{g}")]),
+            (M.MISFIT, worth_misfit(g, deg=0.0, focal=-0.003, centre=0.00099), {}, REJECTED, [C(f"misfit_{g}")]),
+        )
+    ),
     # verdict_camera: parts that do not fit, before all else
     (M.CAMERA, parts(inconsistent=True), {}, REJECTED, [C.INCONSISTENT]),
     (M.CAMERA, parts(inconsistent=None), {}, ACCEPTED, []),
@@ -282,6 +316,7 @@ def test_a_policy_is_its_members(policy, wrong, verdict):
         ([ACCEPTED, UNDETERMINED], UNDETERMINED),
         ([UNDETERMINED, REJECTED, ACCEPTED], REJECTED),
         (["accepted", "rejected"], REJECTED),
+        (["accepted", "a word of a later version"], UNDETERMINED),
     ],
 )
 def test_one_rejection_rejects_and_undetermined_is_no_pass(verdicts, said):
