@@ -45,7 +45,7 @@ from sfm_audit.audit.table.words import (
 ACCEPTED, REJECTED, UNDETERMINED = Verdict.ACCEPTED, Verdict.REJECTED, Verdict.UNDETERMINED
 G, C, M = MisfitGroup, ReasonCode, Member
 WRONG = "pose or camera wrong otherwise"
-SHARED = SharedMisfit(7, 12, G.TANGENTIAL, 0.41, 1e-9)
+SHARED = SharedMisfit.of(7, 12, G.TANGENTIAL, 0.41, 1e-9)
 
 
 def judged(diagnostics, member, **settings):
@@ -138,7 +138,7 @@ def judged(diagnostics, member, **settings):
         (camera(focal_over_size=0.1), M.PLAUSIBLE, "focal_out_of_range: f / max(w, h) = 0.1, outside [0.3, 10]"),
         (camera(folds_over=True), M.PLAUSIBLE, "distortion_folds: inside the image of 1600 x 1200 px"),
         (
-            camera(principal_point_px=(-1.0, 2.0), principal_point_outside=True),
+            camera(principal_point_px=(-1.0, 2.0)),
             M.PLAUSIBLE,
             "principal_point_outside: (-1.0, 2.0) px, image of 1600 x 1200 px",
         ),

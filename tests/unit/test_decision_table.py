@@ -209,9 +209,15 @@ TABLE = [
     (M.PLAUSIBLE, camera(focal_over_size=-5.0), {}, REJECTED, [C.FOCAL_OUT_OF_RANGE]),
     (M.PLAUSIBLE, camera(focal_over_size=NAN), {}, REJECTED, [C.FOCAL_OUT_OF_RANGE]),
     (M.PLAUSIBLE, camera(focal_over_size=NAN, principal_point_px=None, has_focal=False), {}, ACCEPTED, []),
-    (M.PLAUSIBLE, camera(principal_point_px=None, principal_point_outside=True), {}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(folds_over=True), {}, REJECTED, [C.DISTORTION_FOLDS]),
-    (M.PLAUSIBLE, camera(principal_point_outside=True), {}, REJECTED, [C.PRINCIPAL_POINT_OUTSIDE]),
+    *(
+        (M.PLAUSIBLE, camera(principal_point_px=inside), {}, ACCEPTED, [])
+        for inside in ((0.0, 0.0), (1600.0, 1200.0), (1600.0, 600.0))
+    ),
+    *(
+        (M.PLAUSIBLE, camera(principal_point_px=outside), {}, REJECTED, [C.PRINCIPAL_POINT_OUTSIDE])
+        for outside in ((-0.1, 600.0), (800.0, -0.1), (1600.1, 600.0), (800.0, 1200.1))
+    ),
     (M.PLAUSIBLE, camera(sd_focal_rel=0.005), {}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(sd_focal_rel=0.00501), {}, UNDETERMINED, [C.FOCAL_NOT_IDENTIFIED]),
     (M.PLAUSIBLE, camera(sd_focal_rel=0.00501), {"max_sd_focal_rel": 0.01}, ACCEPTED, []),
