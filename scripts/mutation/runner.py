@@ -32,6 +32,8 @@ PRELOADED: Final = (
     "scipy.linalg",
 )
 PRELOADED_TOO: Final = ("scipy.sparse", "scipy.optimize", "scipy.stats", "pycolmap", "threadpoolctl")
+OWN: Final = ("sfm_audit.audit.misfit", "sfm_audit.loaders.model")
+"""What most targets import and are not: loaded once too, and again by the mutants of what is in there."""
 TIMEOUT_S: Final = 120.0
 _TESTS_PASSED, _TESTS_FAILED, _INTERRUPTED = 0, 1, 2  # pytest's exit codes; collecting a broken module interrupts
 
@@ -75,7 +77,7 @@ class Runner:
         self._root = root
         self._jobs = jobs or os.cpu_count() or 1
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")  # before NumPy comes
-        for name in (*PRELOADED, *PRELOADED_TOO):
+        for name in (*PRELOADED, *PRELOADED_TOO, *OWN):
             importlib.import_module(name)
 
     def check_unchanged(self, tests: Iterable[tuple[str, ...]]) -> None:
@@ -121,6 +123,9 @@ class Runner:
         import pytest  # noqa: PLC0415 # imported by the parent already
 
         if mutant is not None:
+            if mutant.module in sys.modules:
+                for name in [name for name in sys.modules if name.partition(".")[0] == "sfm_audit"]:
+                    del sys.modules[name]
             sys.meta_path.insert(0, _Changed(mutant, self._root))
         os.chdir(self._root)
         arguments = [*(f"tests/{test}" for test in tests), "-x", "-q", "-p", "no:cacheprovider", "--no-header"]
