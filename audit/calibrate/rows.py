@@ -12,7 +12,8 @@ import pyarrow as pa
 from sfm_audit.audit.calibrate.estimate import DegenerateInputError, Estimate
 from sfm_audit.audit.calibrate.evidence import correlation_focal_depth
 from sfm_audit.audit.calibrate.validation import Validation, degenerate_judgement
-from sfm_audit.audit.engine.rows import cause_columns, misfit_columns, normality_columns
+from sfm_audit.audit.decision.columns import cause_columns
+from sfm_audit.audit.engine.rows import misfit_columns, normality_columns
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import schema
 from sfm_audit.audit.table.arrow import Coded, Values, build_table

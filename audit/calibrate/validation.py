@@ -34,6 +34,7 @@ from sfm_audit.audit.decision.diagnostics import (
 )
 from sfm_audit.audit.decision.members import Judgement, undetermined
 from sfm_audit.audit.decision.misfit import MisfitDecision
+from sfm_audit.audit.inliers.residuals import longest_px
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.misfit.multiplicity import holm
@@ -261,7 +262,6 @@ def _diagnostics(
             focal_over_size=found.plausibility.focal_over_size,
             folds_over=found.plausibility.folds_over,
             principal_point_px=found.plausibility.principal_point_px,
-            principal_point_outside=found.plausibility.principal_point_outside,
             size_px=found.plausibility.size_px,
             coverage=found.coverage,
             occupied_cells=found.occupied_cells,
@@ -272,7 +272,7 @@ def _diagnostics(
             k1=known.k1 if known.has_k1 else None,
             sd_k1=known.sd_k1,
         ),
-        largest_residual_px=float(np.abs(residuals_px).max(initial=0.0)),
+        largest_residual_px=longest_px(residuals_px),
         longer_side_px=max(camera.width, camera.height),
         remarks=() if warning is None else (warning,),
     )

@@ -12,13 +12,12 @@ from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.table.thresholds import SINGULAR_SHARE
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
 POSE_NAMES: Final = ("rotation_x", "rotation_y", "rotation_z", "translation_x", "translation_y", "translation_z")
-SINGULAR: Final = 1e-9
-"""Share of the largest singular value (columns of unit length) at or below which nothing is identified."""
 _SMALLEST_PIVOT: Final = 1e-10  # of the Gram matrix of unit columns: below it the singular values are taken exactly
 
 
@@ -49,7 +48,7 @@ class ParameterCovariance:
     @property
     def is_singular(self) -> bool:
         """Whether some combination of the parameters leaves all predictions where they are."""
-        return self.singular_share <= SINGULAR
+        return self.singular_share <= SINGULAR_SHARE
 
     @property
     def sd(self) -> FloatArray:
@@ -98,7 +97,7 @@ def parameter_covariance(columns: FloatArray, names: tuple[str, ...], sigma_px: 
     if not names or not np.isfinite(norms).all():
         return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), math.nan)
     inverse_root, share = _inverse_root(flat / norms[:, None])
-    if share <= SINGULAR:
+    if share <= SINGULAR_SHARE:
         return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), share)
     inverse_root *= sigma_px / norms[:, None]
     return ParameterCovariance(names, inverse_root @ inverse_root.T, share)
@@ -114,7 +113,7 @@ def _inverse_root(unit: FloatArray) -> tuple[FloatArray, float]:
         _, singular, rows = np.linalg.svd(triangle)
         values, vectors = singular[::-1] ** 2, rows[::-1].T
     share = math.sqrt(max(float(values[0] / values[-1]), 0.0))
-    if share <= SINGULAR:
+    if share <= SINGULAR_SHARE:
         return np.full_like(vectors, np.nan), share
     return np.asarray(vectors / np.sqrt(values)), share
 

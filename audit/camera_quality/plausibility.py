@@ -36,13 +36,6 @@ class CameraPlausibility:
     principal_point_px: tuple[float, float] | None
     size_px: tuple[int, int]
 
-    @property
-    def principal_point_outside(self) -> bool:
-        """Whether the principal point lies outside the image."""
-        if self.principal_point_px is None:
-            return False
-        return not all(0.0 <= at <= size for at, size in zip(self.principal_point_px, self.size_px, strict=True))
-
 
 def camera_plausibility(camera: CameraRecord) -> CameraPlausibility:
     """Measure a camera whose parameters are finite; it depends on nothing else, so once per camera is enough."""

@@ -74,13 +74,16 @@ def misfit_groups(
 
 @dataclass(frozen=True, slots=True)
 class SharedMisfit:
-    """A camera whose images together show a material misfit: its id, its images, the group with effect and q."""
+    """A camera whose images together show a material misfit: the group and its effect, and the same in words."""
 
-    camera_id: int
-    num_images: int
     group: MisfitGroup
     px: float
-    q: float
+    text: str
+
+    @classmethod
+    def of(cls, camera_id: int, num_images: int, group: MisfitGroup, px: float, q: float) -> SharedMisfit:
+        """Put camera, images, group, effect and q into words."""
+        return cls(group, px, f"camera {camera_id}, {num_images} images: {group} {px:.2f} px, q = {q:.2g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +110,7 @@ class CameraDiagnostics:
     """Measures of the camera, and what the image says about it (method.md section 6).
 
     focal_over_size: f / max(width, height).    principal_point_px: None where the camera has none (panoramas).
+    size_px: width and height.
     sd_focal_rel, sd_k1: standard deviations, NaN where unknown.    singular_share: smallest / largest singular value of
     the parameters' columns, NaN where derivatives are not finite.    is_singular: some combination has no effect.
     is_joint: whether the deviations are those of the joint system, or conditional on the points.
@@ -115,7 +119,6 @@ class CameraDiagnostics:
     focal_over_size: float
     folds_over: bool
     principal_point_px: tuple[float, float] | None
-    principal_point_outside: bool
     size_px: tuple[int, int]
     coverage: float
     occupied_cells: int
@@ -126,6 +129,13 @@ class CameraDiagnostics:
     k1: float | None
     sd_k1: float
     is_joint: bool = False
+
+    @property
+    def principal_point_outside(self) -> bool:
+        """Whether the principal point lies outside the image."""
+        if self.principal_point_px is None:
+            return False
+        return not all(0.0 <= at <= size for at, size in zip(self.principal_point_px, self.size_px, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +200,7 @@ class Diagnostics:
     """All that is decided upon, of one image or of one estimated camera.
 
     unusable: what makes it impossible to project any point.    num_inliers: observations behind all that follows.
-    largest_residual_px, longer_side_px: 2D points whose residuals are rounding were not measured.
+    largest_residual_px: length of the longest one, against longer_side_px: what is only rounded was not measured.
     misfit, camera: None without inliers.    remarks: reasons that decide nothing, found elsewhere.
     consistency, own, gains: None where nobody asked; has_own: whether the camera has own parameters to ask for.
     half_pixel: its 2D points, and those of most images, are shifted by half a pixel (finding pixel_convention).

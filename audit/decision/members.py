@@ -113,8 +113,7 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
                 Reason(
                     ReasonCode.SHARED_CAMERA,
                     member,
-                    f"camera {shared.camera_id}, {shared.num_images} images: "
-                    f"{shared.group} {shared.px:.2f} px, q = {shared.q:.2g}",
+                    shared.text,
                     shared.px,
                     found.tau_px,
                     "px",

@@ -24,7 +24,7 @@ from sfm_audit.audit.decision.diagnostics import (
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import image_advice
 from sfm_audit.audit.inliers.projected import inliers_of
-from sfm_audit.audit.inliers.residuals import image_residuals
+from sfm_audit.audit.inliers.residuals import image_residuals, longest_px
 from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
@@ -208,7 +208,7 @@ def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
         pose_offset_px=evidence.pose_offset_px,
         misfit=evidence.misfit,
         camera=evidence.camera or (None if evidence.quality is None else camera_diagnostics(evidence.quality)),
-        largest_residual_px=float(np.abs(evidence.residuals_px).max(initial=0.0)),
+        largest_residual_px=longest_px(evidence.residuals_px),
         longer_side_px=0 if camera is None else max(camera.width, camera.height),
         unusable=_unusable(evidence.inliers.image),
         consistency=evidence.consistency,
@@ -226,7 +226,6 @@ def camera_diagnostics(quality: CameraQuality) -> CameraDiagnostics:
         focal_over_size=shape.focal_over_size,
         folds_over=shape.folds_over,
         principal_point_px=shape.principal_point_px,
-        principal_point_outside=shape.principal_point_outside,
         size_px=shape.size_px,
         coverage=quality.coverage,
         occupied_cells=quality.occupied_cells,

@@ -209,7 +209,7 @@ class ModelAuditor:
         if camera is None or len(camera.image_idxs) < 2 or not camera.misfit.material or camera.misfit.group is None:
             return None
         found = camera.misfit
-        return SharedMisfit(camera_id, len(camera.image_idxs), camera.misfit.group, found.px, found.q)
+        return SharedMisfit.of(camera_id, len(camera.image_idxs), camera.misfit.group, found.px, found.q)
 
     @cached_property
     def stored_errors(self) -> StoredErrors:

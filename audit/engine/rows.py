@@ -6,13 +6,13 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import NamedTuple
 
 import numpy as np
 
+from sfm_audit.audit.decision.columns import cause_columns, verdict_columns, worth_columns
 from sfm_audit.audit.decision.decide import Decision
-from sfm_audit.audit.decision.diagnostics import OwnDiagnostics
-from sfm_audit.audit.decision.misfit import MisfitDecision
-from sfm_audit.audit.decision.severity import worth_of
+from sfm_audit.audit.decision.diagnostics import Diagnostics, GroupDiagnostics, OwnDiagnostics, Worth
 from sfm_audit.audit.engine.camera import CameraAudit
 from sfm_audit.audit.engine.image import ImageAudit
 from sfm_audit.audit.engine.jointly import implied_of, own_diagnostics
@@ -23,7 +23,7 @@ from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.columns import IMPLIED, own_parameter_names
-from sfm_audit.audit.table.words import Member, Verdict
+from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
 
@@ -67,12 +67,9 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         "pose_offset_px": audit.pose_offset_px,
         **_camera_columns(audit),
         **own_columns(audit.diagnostics.own),
+        **_deciding_columns(audit.diagnostics),
         **{name: audit.implied.get(name, math.nan) for name in IMPLIED},
-        "verdict": str(audit.verdict),
-        **{str(member): audit.decision.of(member) for member in Member},
-        "severity": audit.decision.severity,
-        "reasons": [str(reason) for reason in audit.reasons],
-        "reason_details": audit.decision.all_reasons,
+        **verdict_columns(audit.decision),
     }
 
 
@@ -157,15 +154,6 @@ def misfit_columns(tests: MisfitTests | None) -> Row:
     return row
 
 
-def cause_columns(misfit: MisfitDecision | None) -> Row:
-    """Return the named cause, its effect and q."""
-    return {
-        "misfit_group": str(misfit.group) if misfit and misfit.group else None,
-        "misfit_px": misfit.px if misfit else math.nan,
-        "misfit_q": misfit.q if misfit else math.nan,
-    }
-
-
 def _joint_misfit_columns(audit: ImageAudit) -> Row:
     """Effect, q and rank of every group in the joint test, and what the named misfit is worth."""
     misfit, found = audit.diagnostics.misfit, audit.misfit
@@ -175,14 +163,44 @@ def _joint_misfit_columns(audit: ImageAudit) -> Row:
         row[f"misfit_{group}_px_joint"] = test.px if test else math.nan
         row[f"misfit_{group}_q_joint"] = test.q if test else math.nan
         row[f"misfit_{group}_rank_joint"] = test.rank if test else None
-    worth = worth_of(found, misfit)
-    sigma_px = audit.constant.sigma_constant_px
     return {
         **row,
-        "misfit_px_sigma": found.px / sigma_px if found and sigma_px > 0 else math.nan,
-        "misfit_worth_deg": worth.rotation_deg if worth else math.nan,
-        "misfit_worth_centre": worth.centre_rel if worth else math.nan,
-        "misfit_worth_focal_rel": worth.focal_rel if worth else math.nan,
+        "num_misfit_tested": misfit.num_tested if misfit else None,
+        "misfit_details": [_MisfitDetail.of(group, misfit.groups[group]) for group in GROUPS] if misfit else None,
+        **worth_columns(found, misfit, audit.constant.sigma_constant_px),
+    }
+
+
+class _MisfitDetail(NamedTuple):
+    """An element of ``misfit_details``."""
+
+    group: str
+    status: str
+    gain: float
+    worth_deg: float
+    worth_centre: float
+    worth_focal_rel: float
+
+    @classmethod
+    def of(cls, group: MisfitGroup, test: GroupDiagnostics) -> _MisfitDetail:
+        """Return what the table keeps beside px, q and rank; numbers that are not known are NaN."""
+        worth = test.worth or Worth(math.nan, math.nan, math.nan)
+        gain = test.gain if math.isfinite(test.gain) else math.nan
+        return cls(group, test.status, gain, worth.rotation_deg, worth.centre_rel, worth.focal_rel)
+
+
+def _deciding_columns(diagnostics: Diagnostics) -> Row:
+    """The rest of what decides, so that a finished run can be decided again."""
+    own, gains, camera = diagnostics.own, diagnostics.gains, diagnostics.camera
+    return {
+        "own_num_images": own.num_images if own else None,
+        "own_sigma_px": own.sigma_px if own else math.nan,
+        "own_implied": own.largest.implied if own and own.largest else math.nan,
+        "gain_pose": gains.pose if gains else math.nan,
+        "gain_camera": gains.camera if gains else math.nan,
+        "gain_both": gains.both if gains else math.nan,
+        "singular_share": camera.singular_share if camera else math.nan,
+        "half_pixel": diagnostics.half_pixel,
     }
 
 

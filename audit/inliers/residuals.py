@@ -147,6 +147,11 @@ def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:
     return xyz
 
 
+def longest_px(residuals_px: FloatArray) -> float:
+    """Return the length of the longest residual of (2, n), 0 without any."""
+    return float(np.sqrt((residuals_px**2).sum(axis=0).max(initial=0.0)))
+
+
 def model_residuals(model: SparseModel) -> ModelResiduals:
     """Return the inliers of all images with their residuals; one pass over the images, arrays throughout."""
     observations = model.observations

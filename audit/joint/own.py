@@ -10,9 +10,9 @@ import numpy as np
 
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.system import JointSystem
+from sfm_audit.audit.table.thresholds import MIN_OWN_STEP_SDS
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
-MIN_SDS: Final = 5.0
 _CURVED: Final = 0.01  # relative step of a focal length from which on its second order matters
 
 
@@ -46,10 +46,13 @@ class CameraStep:
     focal_identified: bool
     implied: FloatArray
 
-    def is_material(self, tau_px: float, min_sds: float = MIN_SDS) -> bool:
-        """Whether both steps gain more than tau and a parameter moves by more than ``min_sds`` sd in both."""
+    def is_material(self, tau_px: float) -> bool:
+        """Whether both steps gain more than tau and a parameter moves by more than 5 sd in both.
+
+        Whom the joint test leaves out: `sfm_audit.audit.decision.camera.material_step` rejects the same cameras.
+        """
         gain_px = min(self.own_step_px, self.plain_step_px)
-        return bool(gain_px > tau_px and (np.abs(self.agreed) > min_sds * self.sd).any())
+        return bool(gain_px > tau_px and ((np.abs(self.agreed) > MIN_OWN_STEP_SDS * self.sd) & (self.sd > 0)).any())
 
     @property
     def agreed(self) -> FloatArray:

@@ -14,6 +14,7 @@ from sfm_audit.audit.table.arrow import build_table
 from sfm_audit.audit.table.calibration import CALIBRATION, CALIBRATION_RESIDUALS
 from sfm_audit.audit.table.kinds import (
     CODED_TEXT,
+    MISFIT_DETAIL,
     REASON_DETAIL,
     Column,
     count,
@@ -76,6 +77,10 @@ def _joint_misfit() -> tuple[Column, ...]:
         ]
     return (
         *out,
+        count("num_misfit_tested", "inliers behind the joint test; null without inliers"),
+        Column(
+            "misfit_details", list_of(MISFIT_DETAIL), "text", "every group in the joint test: status, BIC gain, worth"
+        ),
         number("misfit_px_sigma", "misfit_px / sigma_constant_px"),
         Column("misfit_worth_deg", pa.float64(), "deg", "rotation of the image if misfit_group were admitted"),
         number("misfit_worth_centre", "shift of its centre then, in units of the median depth"),
@@ -175,6 +180,14 @@ IMAGES: Final[tuple[Column, ...]] = (
     number("sd_focal_rel_conditional", "largest sd_f / f, conditional on the points: a lower bound"),
     number("sd_k1_conditional", "sd of the first distortion parameter, conditional on the points: a lower bound"),
     *_own_steps(),
+    count("own_num_images", "images of the camera in the joint system; null where this one takes no part"),
+    px("own_sigma_px", "their median sigma_constant_px"),
+    number("own_implied", "implied value of the own parameter whose step is most of its standard deviations"),
+    number("gain_pose", "what freeing the image's pose alone would gain in the joint system, in units of the noise"),
+    number("gain_camera", "what freeing its camera's own parameters alone would gain"),
+    number("gain_both", "what freeing both would gain"),
+    number("singular_share", "smallest / largest singular value of the unit columns of pose and camera; ~0: singular"),
+    flag("half_pixel", "whether its 2D points, and those of most images, are shifted by (0.5, 0.5) px"),
     number("focal_over_size", "first focal length / max(width, height)"),
     flag("folds_over", "whether the distortion folds inside the image"),
     px("expected_error_px", "expected error of a measurement with this camera and pose, median over a 16 x 16 grid"),

@@ -96,4 +96,16 @@ REASON_DETAIL: Final = pa.struct(
 )
 """One reason: its code, the verdict it speaks for, the number that triggered it, its limit, and the same in words."""
 
+MISFIT_DETAIL: Final = pa.struct(
+    [
+        ("group", pa.string()),
+        ("status", pa.string()),
+        ("gain", pa.float64()),
+        ("worth_deg", pa.float64()),
+        ("worth_centre", pa.float64()),
+        ("worth_focal_rel", pa.float64()),
+    ]
+)
+"""One group in the joint test: why it has a q, or why not, BIC gain, and what admitting it would do to the image."""
+
 CODED_TEXT: Final = pa.dictionary(pa.int32(), pa.string())  # millions of rows, few different texts

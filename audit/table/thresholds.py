@@ -41,6 +41,8 @@ MIN_OWN_STEP_SDS: Final = 5.0
 """An own parameter's step counts from so many of its standard deviations on (method.md section 11)."""
 EXACT_SHARE: Final = 2.0**-23
 """Residuals below this share of the longer side of the image are rounding of float32, not measurement."""
+SINGULAR_SHARE: Final = 1e-9
+"""Share of the largest singular value (columns of unit length) at or below which nothing is identified."""
 HALF_PIXEL_SHIFT_PX: Final = 0.5**0.5
 """RMS of a shift by half a pixel in x and in y: another convention of pixel centres."""
 HARD_WORTH_DEG: Final = 0.2

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
 from corpus import CORPUS, needs_corpus
+from decision_samples import CAMERA
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -146,7 +148,7 @@ def test_every_model_without_distortion_is_plausible(model):
     params = [known.get(name, 0.1 if name in {"omega", "beta", "alpha"} else 0.0) for name in model.param_names]
     found = camera_plausibility(camera_of(model.name, params))
     assert not found.folds_over
-    assert not found.principal_point_outside
+    assert not replace(CAMERA, principal_point_px=found.principal_point_px).principal_point_outside
     assert np.isnan(found.focal_over_size) if model.is_spherical else found.focal_over_size == 1300.0 / 1600.0
 
 
@@ -155,7 +157,10 @@ def test_every_model_without_distortion_is_plausible(model):
     [((0, 0), False), ((1600, 1200), False), ((-1, 600), True), ((800, 1200.5), True), ((1601, 600), True)],
 )
 def test_principal_point(centre, outside):
-    assert camera_plausibility(camera_of("SIMPLE_PINHOLE", (1000, *centre))).principal_point_outside is outside
+    found = camera_plausibility(camera_of("SIMPLE_PINHOLE", (1000, *centre)))
+    assert found.principal_point_px == centre
+    measured = replace(CAMERA, principal_point_px=found.principal_point_px, size_px=found.size_px)
+    assert measured.principal_point_outside is outside
 
 
 def test_degenerate_numbers_do_not_raise():

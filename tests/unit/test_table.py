@@ -62,10 +62,10 @@ def test_types_are_design_s(column):
     elif (
         column.name.startswith("num_")
         or column.name.endswith(("_rank", "_rank_joint"))
-        or column.name in {"occupied_cells", "joint_blocks"}
+        or column.name in {"occupied_cells", "joint_blocks", "own_num_images"}
     ):
         wanted = pa.int64()
-    elif column.name in {"noise_converged", "folds_over", "misfit_material"}:
+    elif column.name in {"noise_converged", "folds_over", "misfit_material", "half_pixel"}:
         wanted = pa.bool_()
     elif column.name in TEXT:
         wanted = pa.string()
@@ -78,6 +78,10 @@ def test_types_are_design_s(column):
         fields = dict.fromkeys(texts, pa.string()) | dict.fromkeys(numbers, pa.float64())
         order = ("code", "verdict", "value", "limit", "unit", "group", "text")
         wanted = pa.list_(pa.struct({name: fields[name] for name in order}))
+    elif column.name == "misfit_details":
+        numbers = ("gain", "worth_deg", "worth_centre", "worth_focal_rel")
+        texts = ("group", "status")
+        wanted = pa.list_(pa.struct({**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())}))
     elif column.name == "findings":
         wanted = pa.list_(pa.struct({"code": pa.string(), "count": pa.int64(), "text": pa.string()}))
     else:

@@ -1,0 +1,220 @@
+"""Where it is decided, and which tests have to notice a change there; and mutants that once survived, by name."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from scripts.mutation.mutants import Named, Target
+
+DECISION: Final = tuple(f"unit/test_decision_{name}.py" for name in ("table", "reasons", "severity", "cause"))
+NUMBERS: Final = ("unit/test_decision_numbers.py",)
+LIMITS: Final = ("unit/test_consistency_limits.py", "unit/test_consistency.py")
+ROUNDS: Final = ("unit/test_joint_rounds.py",)
+NO_SCALE: Final = ("unit/test_keypoint_scale_noise.py::test_too_few_tracks_are_not_fitted",)
+
+TARGETS: Final = (
+    Target("audit/decision/decide.py", DECISION),
+    Target("audit/decision/members.py", DECISION),
+    Target(
+        "audit/decision/camera.py",
+        DECISION,
+        ("judge_camera", "_judge_own", "material_step", "_not_optimal", "pose_alone", "_MOST"),
+    ),
+    Target(
+        "audit/decision/misfit.py",
+        DECISION,
+        ("decide_misfit", "is_worth_nothing", "named_cause", "_SHIFTS", "_SAYS_NOTHING"),
+    ),
+    Target("audit/decision/severity.py", DECISION, ("severity_of", "worth_of", "worth_severity", "_ALWAYS_HARD")),
+    Target(
+        "audit/decision/diagnostics.py",
+        DECISION,
+        (
+            "MisfitDiagnostics.num_lens_groups",
+            "CameraDiagnostics.principal_point_outside",
+            "OwnDiagnostics.largest",
+        ),
+    ),
+    Target(
+        "audit/table/words.py",
+        DECISION,
+        ("VERDICT_ORDER", "POLICIES", "LENS_GROUPS", "SEVERITY_ORDER", "is_remark", "strongest", "verdict_under"),
+    ),
+    Target(
+        "audit/table/thresholds.py",
+        (*DECISION, *NUMBERS),
+        (
+            *("ALPHA", "MIN_KS_DISTANCE", "MIN_OBSERVATIONS", "MAX_POSE_OFFSET_PX", "MIN_FOCAL_OVER_SIZE"),
+            *("MAX_FOCAL_OVER_SIZE", "MAX_SD_FOCAL_REL", "MIN_K1_SDS", "MIN_COVERAGE", "MIN_OCCUPIED_CELLS"),
+            *("MAX_NOISE_DISTANCE", "KS_CRITICAL", "MIN_OWN_STEP_SDS", "EXACT_SHARE", "HALF_PIXEL_SHIFT_PX"),
+            *("HARD_WORTH_DEG", "HARD_WORTH_FOCAL_REL", "WEAK_WORTH_DEG", "WEAK_WORTH_FOCAL_REL"),
+            *("MIN_SHIFT_WORTH_CENTRE", "MIN_SHIFT_WORTH_FOCAL_REL", "effect_px"),
+        ),
+    ),
+    Target(
+        "audit/engine/jointly.py",
+        NUMBERS,
+        (
+            *("misfit_diagnostics", "untested_misfit", "_group", "consistency_diagnostics", "own_diagnostics"),
+            *("gains_of", "joint_camera", "_IMPLIED_COLUMNS", "implied_of"),
+        ),
+    ),
+    Target("audit/engine/model.py", NUMBERS, ("ModelAuditor._shared_misfit",)),
+    Target("audit/engine/camera.py", NUMBERS, ("image_advice",)),
+    Target(
+        "audit/consistency/image.py", LIMITS, ("ConsistencyLimits", "_judged", "_exceeds", "_is_tail", "_half_pixel")
+    ),
+    Target(
+        "audit/consistency/model.py",
+        LIMITS,
+        ("model_consistency", "_without_lone_scales", "_pixel_convention", "_common_cause"),
+    ),
+    Target("audit/joint/own.py", NUMBERS, ("CameraStep.is_material", "CameraStep.agreed")),
+    Target(
+        "audit/joint/group_test.py",
+        ROUNDS,
+        (
+            *("test_group", "group_root", "_quadratic_form", "KEPT_EIGENVALUE", "MIN_OBSERVATIONS_PER_RANK"),
+            "MAX_EFFECT_OVER_RMS",
+        ),
+    ),
+    Target(
+        "audit/joint/misfit.py",
+        ROUNDS,
+        (
+            *("MAX_ROUNDS", "_INCLUDE_FROM_PX", "_SHARE_OF_LARGEST", "joint_misfit", "_nothing", "_Rounds.__init__"),
+            *("_Rounds.run", "_Rounds._test", "_Rounds._significant", "_Rounds._effects", "_Rounds._include"),
+            *("_Rounds._touched", "_Rounds._result", "_Rounds._cause"),
+        ),
+    ),
+)
+
+# What survived before there was a decision table (issue of the vocabulary), in the words of today's code.
+NAMED: Final = (
+    Named(
+        "an image is rejected for a significant misfit that is not material",
+        "audit/decision/members.py",
+        "if found.group is not None and found.material:",
+        "if found.group is not None:",
+        DECISION,
+    ),
+    Named(
+        "a camera is named as a whole beside images that are accepted",
+        "audit/decision/members.py",
+        "    return Judgement(Verdict.ACCEPTED, remarks)\n",
+        "    return Judgement(Verdict.REJECTED if misfit.shared else Verdict.ACCEPTED, remarks)\n",
+        DECISION,
+    ),
+    Named(
+        "verdict_pose ignores its setting",
+        "audit/decision/members.py",
+        "limit = settings.pose_offset_threshold_px",
+        "limit = 0.5",
+        DECISION,
+    ),
+    Named(
+        "the cause is taken from groups that are not material",
+        "audit/decision/misfit.py",
+        "cause = named_cause(groups, material or significant)",
+        "cause = named_cause(groups, significant)",
+        DECISION,
+    ),
+    Named(
+        "the joint test's cause is taken from groups that are not material",
+        "audit/joint/misfit.py",
+        "return max(material or significant, key=",
+        "return max(significant, key=",
+        ROUNDS,
+    ),
+    Named(
+        "fields are admitted from 0.3 px on",
+        "audit/joint/misfit.py",
+        "_INCLUDE_FROM_PX: Final = 0.1",
+        "_INCLUDE_FROM_PX: Final = 0.3",
+        ROUNDS,
+    ),
+    Named(
+        "fields are admitted from 0.1 px on whatever tau is",
+        "audit/joint/misfit.py",
+        "np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)",
+        "np.full(num_images, _INCLUDE_FROM_PX)",
+        ROUNDS,
+    ),
+    Named(
+        "fields are admitted that have a fifth of the largest",
+        "audit/joint/misfit.py",
+        "_SHARE_OF_LARGEST: Final = 0.5",
+        "_SHARE_OF_LARGEST: Final = 0.2",
+        ROUNDS,
+    ),
+    Named(
+        "fields are admitted though most images would be",
+        "audit/joint/misfit.py",
+        "if not new.any() or 2 * np.count_nonzero(new | (self._round >= 0)) > num_tested:",
+        "if not new.any():",
+        ROUNDS,
+    ),
+    Named(
+        "the page takes tau in sigma for unknown",
+        "reports/html/page.py",
+        "effect_px(str(effect), sigma_px)",
+        "effect_px(str(effect), None)",
+        NUMBERS,
+    ),
+    Named(
+        "explain takes tau in sigma for unknown",
+        "audit/cli/recompute.py",
+        "effect_px(effect, sigma_px)",
+        "effect_px(effect, None)",
+        NUMBERS,
+    ),
+    Named(
+        "tau in sigma is taken for px",
+        "audit/table/thresholds.py",
+        'float(min_effect.removesuffix("sigma")) * sigma_px',
+        'float(min_effect.removesuffix("sigma"))',
+        (*DECISION, *NUMBERS),
+    ),
+    Named(
+        "a shared camera of one image",
+        "audit/engine/model.py",
+        "len(camera.image_idxs) < 2",
+        "len(camera.image_idxs) < 1",
+        NUMBERS,
+    ),
+    Named(
+        "the noise of a camera's images is their largest",
+        "audit/engine/model.py",
+        "float(np.median(self.sigma_constant_px[step.image_idxs]))",
+        "float(np.max(self.sigma_constant_px[step.image_idxs]))",
+        NUMBERS,
+    ),
+    Named(
+        "tau of a camera is the largest of its images",
+        "audit/engine/camera.py",
+        "float(np.median(tau_px[group.image_idxs]))",
+        "float(np.max(tau_px[group.image_idxs]))",
+        NUMBERS,
+    ),
+    Named(
+        "keypoints whose scale explains nothing are weighted by it",
+        "audit/noise/keypoint.py",
+        "(power.gamma if math.isfinite(power.gamma) else 0.0)",
+        "(power.gamma if math.isfinite(power.gamma) else 1.0)",
+        NO_SCALE,
+    ),
+    Named(
+        "the joint test leaves out cameras that the decision accepts",
+        "audit/joint/own.py",
+        "> MIN_OWN_STEP_SDS * self.sd) & (self.sd > 0)",
+        "> 4.0 * self.sd) & (self.sd > 0)",
+        NUMBERS,
+    ),
+    Named(
+        "only the weighted step has to be material",
+        "audit/joint/own.py",
+        "gain_px = min(self.own_step_px, self.plain_step_px)",
+        "gain_px = self.own_step_px",
+        NUMBERS,
+    ),
+)

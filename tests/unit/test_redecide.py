@@ -1,0 +1,225 @@
+"""A finished run decided again: its own settings change nothing, another policy gives what a run under it gives."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from joint_reference import with_param
+
+from sfm_audit.audit import AuditConfig, audit_model
+from sfm_audit.audit.decision.from_table import FixedSettingError, MissingColumnError, RedecisionError, redecide
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
+from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
+from sfm_audit.audit.simulate.demo import demo_scene
+from sfm_audit.audit.simulate.noise import NoiseSpec
+from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.table import schema
+from sfm_audit.audit.table.words import POLICIES, SEVERITY_ORDER, Verdict
+
+RUN = AuditConfig()
+SPEC = SceneSpec(num_images=12, points_per_image=150, noise=NoiseSpec(sigma_px=0.5))
+NUM_DEFECTIVE = 3
+
+
+def images_of(model, settings=RUN) -> pa.Table:
+    """The images table of a run, as it is read from its folder."""
+    buffer = io.BytesIO()
+    pq.write_table(audit_model(model, settings).images, buffer)
+    return pq.read_table(buffer)
+
+
+def assert_same(found: pa.Table, wanted: pa.Table):
+    """All columns, so that nothing that is not decided changes either."""
+    assert found.schema == wanted.schema
+    for name in wanted.column_names:
+        assert repr(found.column(name).to_pylist()) == repr(wanted.column(name).to_pylist()), name  # NaN in lists
+
+
+def model_with(*defects: DefectSpec, spec=SPEC, adjusted=False):
+    scene = simulate_scene(replace(spec, defects=defects), np.random.default_rng(5))
+    return sparse_model(scene, adjust_scene(scene) if adjusted else true_claim(scene))
+
+
+def defective(kind: DefectKind):
+    values = {DefectKind.FEW_POINTS: (15.0, 1.0)}.get(kind)
+    return model_with(*(DefectSpec(i, kind, 1.5, values) for i in range(NUM_DEFECTIVE)), adjusted=True)
+
+
+def broken():
+    """Images that cannot be projected, parts that do not fit, a frozen focal length, a pose that moved."""
+    model = with_param(model_with(adjusted=True), 5, 0, 1200.0)
+    images = model.images
+    quat, translation = images.quat_cam_from_world_wxyz.copy(), images.translation_cam_from_world.copy()
+    translation[2] = np.nan
+    quat[3] = [0.5, 0.5, 0.5, 0.5]
+    translation[4] += 0.02
+    camera_idx = images.camera_idx.copy()
+    camera_idx[7] = -1
+    changed = replace(
+        images, quat_cam_from_world_wxyz=quat, translation_cam_from_world=translation, camera_idx=camera_idx
+    )
+    return with_param(replace(model, images=changed), 6, 0, np.nan)
+
+
+@pytest.fixture(scope="module")
+def broken_model():
+    return broken()
+
+
+@pytest.fixture(scope="module")
+def broken_images(broken_model):
+    return images_of(broken_model)
+
+
+@pytest.mark.parametrize("kind", DefectKind)
+def test_the_runs_own_settings_change_nothing(kind):
+    images = images_of(defective(kind))
+    assert_same(redecide(images, RUN, run=RUN), images)
+
+
+def test_the_demo_decides_as_it_did():
+    scene = simulate_scene(demo_scene(1), np.random.default_rng([1, 1]))
+    images = images_of(sparse_model(scene, adjust_scene(scene)))
+    assert set(images.column("verdict").to_pylist()) == set(Verdict)
+    assert_same(redecide(images, RUN, run=RUN), images)
+
+
+def test_all_that_stands_in_the_way_is_kept(broken_images):
+    codes = {item["code"] for row in broken_images.column("reason_details").to_pylist() for item in row}
+    assert {"non_finite_pose", "missing_camera", "non_finite_camera", "inconsistent"} <= codes
+    assert codes & {"camera_not_optimal", "pose_not_optimal"}
+    assert_same(redecide(broken_images, RUN, run=RUN), broken_images)
+
+
+def test_a_model_that_lies_behind_its_cameras_stays_there():
+    model = model_with()
+    images = replace(model.images, translation_cam_from_world=model.images.translation_cam_from_world - [0, 0, 100.0])
+    table = images_of(replace(model, images=images))
+    assert {item["code"] for row in table.column("reason_details").to_pylist() for item in row} == {"points_behind"}
+    assert_same(redecide(table, RUN, run=RUN), table)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_another_policy_is_a_run_under_it(policy, broken_model, broken_images):
+    under = AuditConfig(policy=policy)
+    assert_same(redecide(broken_images, under, run=RUN), images_of(broken_model, under))
+    assert_same(redecide(images_of(broken_model, under), RUN, run=under), broken_images)
+
+
+LIMITS = [
+    {"min_observations": 140},
+    {"max_noise_distance": 0.0},
+    {"min_ks_distance": 0.9},
+    {"min_focal_over_size": 0.63},
+    {"max_focal_over_size": 0.6},
+    {"max_sd_focal_rel": 1e-4},
+    {"min_k1_sds": 20.0},
+    {"min_coverage": 0.7},
+    {"min_occupied_cells": 45},
+]
+
+
+@pytest.mark.parametrize("limit", LIMITS, ids=lambda limit: next(iter(limit)))
+def test_another_limit_is_a_run_under_it(limit, broken_model, broken_images):
+    under = AuditConfig(**limit)
+    again = redecide(broken_images, under, run=RUN)
+    assert_same(again, images_of(broken_model, under))
+    assert again.column("reason_details").to_pylist() != broken_images.column("reason_details").to_pylist()
+
+
+def test_fewer_observations_are_a_run_that_asks_for_fewer():
+    model, under = defective(DefectKind.FEW_POINTS), AuditConfig(min_observations=10)
+    images = images_of(model)
+    assert images.column("verdict_pose").to_pylist()[:NUM_DEFECTIVE] == ["undetermined"] * NUM_DEFECTIVE
+    again = redecide(images, under, run=RUN)
+    assert "accepted" in again.column("verdict_pose").to_pylist()[:NUM_DEFECTIVE]
+    assert_same(again, images_of(model, under))
+
+
+@pytest.mark.parametrize("changed", [{"min_effect": "2px"}, {"min_effect": "9sigma"}, {"alpha": 1e-200}])
+def test_a_misfit_that_matters_less_is_accepted_with_its_severity(changed):
+    images = images_of(defective(DefectKind.ROLLING_SHUTTER))
+    assert images.column("verdict_misfit").to_pylist()[:NUM_DEFECTIVE] == ["rejected"] * NUM_DEFECTIVE
+    assert set(images.column("severity").to_pylist()[:NUM_DEFECTIVE]) <= set(SEVERITY_ORDER)
+    again = redecide(images, AuditConfig(**changed), run=RUN)
+    assert again.column("verdict_misfit").to_pylist()[:NUM_DEFECTIVE] == ["accepted"] * NUM_DEFECTIVE
+    assert again.column("verdict").to_pylist() == ["accepted"] * SPEC.num_images
+    assert again.column("severity").to_pylist() == [None] * SPEC.num_images
+    assert again.column("advised_camera_model").to_pylist()[:NUM_DEFECTIVE] == [None] * NUM_DEFECTIVE
+
+
+def test_advice_stays_where_nothing_changes_that_it_rests_on():
+    images = images_of(defective(DefectKind.RADIAL_K2))
+    assert any(images.column("advised_camera_model").to_pylist())
+    same = redecide(images, AuditConfig(policy="paper", max_noise_distance=0.9), run=RUN)
+    assert same.column("advised_camera_model").to_pylist() == images.column("advised_camera_model").to_pylist()
+    larger = redecide(images, AuditConfig(min_effect="0.21px"), run=RUN)
+    assert larger.column("verdict").to_pylist() == images.column("verdict").to_pylist()
+    assert larger.column("advised_camera_model").to_pylist()[:NUM_DEFECTIVE] == [None] * NUM_DEFECTIVE
+
+
+# a shared camera is named only while most images of its model are wrong
+
+
+@pytest.fixture(scope="module")
+def shared_model():
+    spec = replace(SPEC, shared_camera=True)
+    return model_with(*(DefectSpec(i, DefectKind.RADIAL_K2, 2.0) for i in range(12)), spec=spec, adjusted=True)
+
+
+def test_a_shared_camera_is_named_while_most_images_are_wrong(shared_model):
+    images = images_of(shared_model)
+    named = [any(r.startswith("shared_camera") for r in row) for row in images.column("reasons").to_pylist()]
+    assert all(named)
+    assert_same(redecide(images, RUN, run=RUN), images)
+    effects = sorted(images.column("misfit_px").to_pylist())
+    middle = f"{0.5 * (effects[6] + effects[7]):.6f}px"
+    again = redecide(images, AuditConfig(min_effect=middle), run=RUN)
+    assert again.column("verdict_misfit").to_pylist().count("rejected") == 5
+    assert not any(r.startswith("shared_camera") for row in again.column("reasons").to_pylist() for r in row)
+
+
+# what cannot be done
+
+
+@pytest.mark.parametrize(
+    ("setting", "changes"),
+    [
+        ("noise", {"noise": "constant"}),
+        ("points", {"noise": "constant", "points": "independent"}),
+        ("min_track_length", {"min_track_length": 4}),
+        ("min_track_eigenvalue", {"min_track_eigenvalue": 0.1}),
+        ("grid", {"grid": 4}),
+        ("min_effect", {"min_effect": "0.19px"}),
+        ("min_effect", {"min_effect": "0.1sigma"}),
+    ],
+)
+def test_what_changes_the_measurements_needs_another_run(setting, changes, broken_images):
+    wanted = AuditConfig(**changes)
+    run = RUN if setting != "points" else AuditConfig(noise="constant")
+    with pytest.raises(FixedSettingError, match=f"^{setting} = ") as caught:
+        redecide(broken_images, wanted, run=run)
+    assert (caught.value.setting, caught.value.wanted) == (setting, getattr(wanted, setting))
+
+
+def test_a_column_of_another_version_is_named(broken_images):
+    with pytest.raises(MissingColumnError, match="gain_pose, misfit_details") as caught:
+        redecide(broken_images.drop_columns(["misfit_details", "gain_pose"]), RUN, run=RUN)
+    assert caught.value.columns == ("gain_pose", "misfit_details")
+
+
+def test_witnesses_outside_are_not_asked_again(broken_images):
+    at = broken_images.column_names.index("verdict_outside")
+    asked = broken_images.set_column(at, "verdict_outside", pa.array(["accepted"] * broken_images.num_rows))
+    with pytest.raises(RedecisionError, match="verdict_outside"):
+        redecide(asked, RUN, run=RUN)
+
+
+def test_no_images_no_decisions():
+    empty = schema("images").empty_table()
+    assert_same(redecide(empty, RUN, run=RUN), empty)
