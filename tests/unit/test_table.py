@@ -146,7 +146,7 @@ def test_values_and_nulls():
     st.lists(
         st.tuples(
             st.none() | st.integers(-(2**63), 2**63 - 1),
-            st.none() | st.floats(allow_nan=False),
+            st.none() | st.floats(allow_nan=False, allow_infinity=False),
             st.none() | st.booleans(),
             st.none() | st.text(st.characters(exclude_categories=["Cs"])),
             st.none() | st.lists(st.none() | st.text(st.characters(exclude_categories=["Cs"]))),
