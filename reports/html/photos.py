@@ -18,7 +18,8 @@ _MAX_PIXELS: Final = 400_000_000  # a file that unpacks to more is no photo
 def find_photo(folder: Path, row: Mapping[str, Any]) -> Path | None:
     """Return the file of an image below ``folder``: under its name, or in the folders of its scene; None without.
 
-    A name that leads out of the folder (``../``, an absolute path) finds nothing.
+    A name that leads out of the folder (``../``, an absolute path) finds nothing, and a link that does neither: to see
+    such photos, name the folder that the links lead to.
     """
     name, scene = str(row["image_name"]), str(row["scene"])
     for below in ("", f"{scene}/images", scene, f"{scene}/dense/images"):
@@ -26,8 +27,9 @@ def find_photo(folder: Path, row: Mapping[str, Any]) -> Path | None:
         if Path(relative).is_absolute() or relative.split(os.sep, 1)[0] == os.pardir or "\0" in relative:
             continue
         try:
-            if (folder / relative).is_file():
-                return folder / relative
+            found = folder / relative
+            if found.is_file() and found.resolve().is_relative_to(folder.resolve()):
+                return found
         except OSError:  # a name that is too long for this file system
             continue
     return None

@@ -190,6 +190,16 @@ def test_photos_are_never_looked_for_outside_their_folder(tmp_path, name):
     assert find_photo(tmp_path / "photos", {"image_name": "secret.jpg", "scene": ".."}) is None
 
 
+def test_photos_are_not_read_through_links_that_lead_out_of_their_folder(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
+    (tmp_path / "photos" / "b.jpg").write_bytes(b"photo")
+    (tmp_path / "photos" / "out.jpg").symlink_to(tmp_path / "secret.jpg")
+    (tmp_path / "photos" / "in.jpg").symlink_to("b.jpg")
+    assert find_photo(tmp_path / "photos", {"image_name": "out.jpg", "scene": "s"}) is None
+    assert find_photo(tmp_path / "photos", {"image_name": "in.jpg", "scene": "s"}) is not None
+
+
 def test_photos_are_found_by_name_or_in_their_scene_and_read_small(tmp_path):
     from PIL import Image  # noqa: PLC0415
 
