@@ -88,7 +88,9 @@ def audit_jointly(
 def _of_block(
     system: JointSystem, block: Block, alpha: float, tau_px: FloatArray, excluded: BoolArray | None
 ) -> tuple[Block, JointAudit]:
-    steps = own_parameters(system)
+    core = np.flatnonzero(block.core).tolist()
+    covariance_of = dict(zip(core, system.image_covariances(core), strict=True))
+    steps = own_parameters(system, covariance_of)
     out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
     material = [step for step in steps if step.is_material(float(np.median(tau_px[step.image_idxs])))]
     for step in material:
@@ -96,10 +98,9 @@ def _of_block(
     settled = {step.camera_idx: step for step in implied_again(system, material)}
     steps = tuple(settled.get(step.camera_idx, step) for step in steps)
     implied = implied_parameters(system, steps)
-    core = np.flatnonzero(block.core).tolist()
     gains = [Gains(math.nan, math.nan, math.nan)] * len(block.core)
     covariances = [np.zeros((0, 0))] * len(block.core)
-    for image, covariance in zip(core, system.image_covariances(core), strict=True):
+    for image, covariance in covariance_of.items():
         gains[image], covariances[image] = image_gains(system, image), covariance
     counts = np.diff(system.observations.offsets)
     misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out)

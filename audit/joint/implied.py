@@ -102,7 +102,7 @@ def _missing_fields(system: JointSystem, image: int) -> ImageFields:
     out[2] = _next_radial(camera, projected)
     out[3] = fields[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
     out[4:] = fields[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
-    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, projected))
+    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image))
 
 
 def _shift_fields(system: JointSystem, image: int) -> ImageFields:

@@ -205,7 +205,7 @@ def _fields_of(system: JointSystem, image: int) -> ImageFields:
     inliers = system.observations.inliers(image)
     camera, projected = inliers.camera, inliers.projected
     fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
-    return ImageFields(fields, system.observations.nuisance(image, projected))
+    return ImageFields(fields, system.observations.nuisance(image))
 
 
 def _image_tests(
