@@ -88,8 +88,8 @@ class BandedFactor:
 
 
 def _triangular(lower: FloatArray, right: FloatArray, *, transposed: bool) -> FloatArray:
-    """L^-1 right, or L^-T right."""
-    return np.asarray(blas.dtrsm(1.0, lower, right, lower=1, trans_a=int(transposed)))
+    """L^-1 right, or L^-T right; as right^T L^-T or right^T L^-1, so that rows in C order need no copy for BLAS."""
+    return np.asarray(blas.dtrsm(1.0, lower, right.T, side=1, lower=1, trans_a=int(not transposed))).T
 
 
 def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> BandedFactor | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import NamedTuple
 
@@ -33,6 +33,18 @@ class CandidateScores:
     support: IntArray
     solution: FloatArray
     num_observations: int
+
+    def only(self, columns: slice) -> CandidateScores:
+        """Return some of the fields; each was projected off the base alone, so that nothing else changes."""
+        return replace(
+            self,
+            sq_length=self.sq_length[columns],
+            gram=self.gram[columns, columns],
+            score=self.score[columns],
+            track_score=self.track_score[:, columns],
+            coupling=self.coupling[:, columns],
+            solution=self.solution[:, columns],
+        )
 
 
 class ImageFields(NamedTuple):
