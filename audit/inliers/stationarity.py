@@ -50,10 +50,15 @@ def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: 
     float
         px; NaN without observations. A bundle-adjusted image has ~0, a pose changed afterwards 1..3.
     """
+    return offset_px(pose_columns(jacobian_cam, xyz_cam), residuals_px)
+
+
+def offset_px(columns: FloatArray, residuals_px: FloatArray) -> float:
+    """Return the same of any six pose columns (6, 2, n) and residuals (2, n): of an image, or of a frame of images."""
     n = residuals_px.shape[1]
     if n == 0:
         return math.nan
-    columns = pose_columns(jacobian_cam, xyz_cam).reshape(6, 2 * n)
+    columns = columns.reshape(6, 2 * n)
     gram = columns @ columns.T
     if not np.isfinite(gram).all():  # at the poles of a panorama: such a point does not move the pose
         columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
