@@ -26,8 +26,9 @@ def claimed_frames(model: SparseModel) -> Frames | None:
     frame_idx, poses = model.images.frame_idx, model.images.pose_cam_from_rig
     if frame_idx is None or poses is None:
         return None
-    rotations = rotation_from_quat(poses[:, :4])
-    transforms = [image_from_frame(rotation, pose[4:]) for rotation, pose in zip(rotations, poses, strict=True)]
+    with np.errstate(all="ignore"):  # a pose that is not finite: its image has no inliers
+        rotations = rotation_from_quat(poses[:, :4])
+        transforms = [image_from_frame(rotation, pose[4:]) for rotation, pose in zip(rotations, poses, strict=True)]
     return Frames(frame_idx, np.array(transforms))
 
 
@@ -72,7 +73,7 @@ def frame_offsets_px(
             image = model.image(image_idx)
             xyz_cam = image.cam_from_world(model.points.xyz_world.take(point_idx[rows], axis=0))
             in_camera = np.linalg.pinv(image.rotation_cam_from_world.T) @ jacobian[:, :, rows]
-            pose = pose_columns(in_camera, xyz_cam.T)
+            pose = pose_columns(in_camera, xyz_cam)
             columns.append(np.einsum("akn,ab->bkn", pose, frames.image_from_frame[image_idx]))
             own.append(residuals[:, rows])
         out[members] = offset_px(np.concatenate(columns, axis=2), np.concatenate(own, axis=1))

@@ -19,7 +19,7 @@ class ImageResiduals:
     """The inliers among the linked points of one image, projected.
 
     inlier_row: (n,) their rows among the points given.          residuals_px: (2, n) observed - projected.
-    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (3, n).
+    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (n, 3).
     d_extra: (e, 2, n) d projection / d distortion parameters, px per unit.
     num_dangling, num_behind, num_nonfinite: points that are no inliers, by cause.
     num_unprojected: of num_nonfinite, those in front of the camera that have no finite projection.
@@ -115,7 +115,7 @@ def image_residuals(
         rows,
         residuals,
         jacobian,
-        xyz_cam.T if rows.size else np.empty((3, 0)),
+        xyz_cam if rows.size else np.empty((0, 3)),
         d_extra,
         num_dangling,
         num_behind,

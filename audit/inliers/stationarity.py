@@ -17,13 +17,13 @@ def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
     Parameters
     ----------
     jacobian_cam : (2, 3, n) d projection / d point in the camera frame, px per model unit
-    xyz_cam : (3, n) points in the camera frame, model units
+    xyz_cam : (n, 3) points in the camera frame, model units
 
     Notes
     -----
     A rotation by the small vector w (rad) about the camera centre moves a point by w x Xc, a translation t by t.
     """
-    x, y, z = xyz_cam
+    x, y, z = xyz_cam.T
     jx, jy, jz = jacobian_cam.transpose(1, 0, 2)
     out = np.empty((6, *jx.shape))
     out[0] = jz * y - jy * z
@@ -35,7 +35,7 @@ def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
 
 def pose_jacobian(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
     """Return (n, 2, 6): `pose_columns` with points first, of (n, 2, 3) and (n, 3)."""
-    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam.T).transpose(2, 1, 0)
+    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam).transpose(2, 1, 0)
 
 
 def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: FloatArray) -> float:

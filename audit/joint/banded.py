@@ -157,14 +157,25 @@ class BandedInverse:
         """(k, D) rows of S^+."""
         return self.times(columns, np.eye(columns.size)).T
 
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        if self._is_near(columns):
+            return np.asarray(self.block(columns) @ right)
+        return self.times(columns, right)[columns]
+
+    def _is_near(self, columns: IntArray) -> bool:
+        """Whether all entries at some columns are at hand."""
+        number = self.factor.band.place[columns] // self.factor.band.width
+        return not number.size or int(number.max() - number.min()) <= _REACH
+
     def block(self, columns: IntArray) -> FloatArray:
         """(k, k) entries of S^+ at some columns."""
+        if not self._is_near(columns):
+            return self.rows(columns)[:, columns]
         place = self.factor.band.place[columns]
         by_place = np.argsort(place, kind="stable")
         place = place[by_place]
         number = place // self.factor.band.width
-        if number.size and number[-1] - number[0] > _REACH:
-            return self.rows(columns)[:, columns]
         out = np.empty((place.size, place.size))
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [place.size]]).tolist()
         for start, stop in pairwise(bounds) if place.size else ():

@@ -36,6 +36,10 @@ class SymmetricInverse(Protocol):
         """S^+ (all rows, at some columns) @ right: (D, c) of (k, c)."""
         ...
 
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        ...
+
     def rows(self, columns: IntArray) -> FloatArray:
         """(k, D) rows of S^+."""
         ...
@@ -62,6 +66,10 @@ class DenseInverse:
         """S^+ (all rows, at some columns) @ right: (D, c) of (k, c)."""
         main = self.array if columns.size == len(self.array) else self.array[columns].T
         return np.asarray(main @ right)
+
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        return np.asarray(self.block(columns) @ right)
 
     def rows(self, columns: IntArray) -> FloatArray:
         """(k, D) rows of S^+."""
@@ -102,7 +110,7 @@ class JointInverse:
         head, tail = right[: base.size], right[base.size :]
         update = self.update[base]
         border = self.border[np.ix_(base, extra)]
-        above = self.main.block(base) @ head + update @ (update.T @ head) + border @ tail
+        above = self.main.within(base, head) + update @ (update.T @ head) + border @ tail
         return np.vstack([above, border.T @ head + self.corner[np.ix_(extra, extra)] @ tail])
 
     def _split(self, support: IntArray) -> tuple[IntArray, IntArray]:

@@ -64,6 +64,8 @@ def test_it_is_the_pseudo_inverse(street, scale):
     for columns in (np.arange(size), near, rng.permutation(near), np.array([0, size - 1, 7]), near[:0]):
         both = scale[columns] * scale[columns][:, None]
         assert_allclose(main.block(columns) * both, expected[np.ix_(columns, columns)], **tolerance)
+        both_sides = main.within(columns, np.eye(len(columns)) * scale[columns]) * scale[columns][:, None]
+        assert_allclose(both_sides, expected[np.ix_(columns, columns)], **tolerance)
         rows = main.rows(columns) * scale * scale[columns][:, None]
         assert_allclose(rows, expected[columns], **tolerance)
     right = rng.normal(size=(size, 3))
