@@ -190,6 +190,8 @@ class ImageTable:
     camera_idx: (I,) row of CameraTable, -1 where the camera does not exist.
     quat_cam_from_world_wxyz: (I, 4) as stored (or composed from rigs and frames), not normalised.
     translation_cam_from_world: (I, 3) model units.    num_points2d: (I,) all 2D points, linked or not.
+    frame_idx: (I,) images of equal number were placed by one pose of their rig; None where no two images were.
+    pose_cam_from_rig: (I, 7) quaternion w x y z as stored and translation, identity for images that no rig places.
     """
 
     image_id: UInt32Array
@@ -199,6 +201,8 @@ class ImageTable:
     quat_cam_from_world_wxyz: FloatArray
     translation_cam_from_world: FloatArray
     num_points2d: IntArray
+    frame_idx: IntArray | None = None
+    pose_cam_from_rig: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.image_id)

@@ -154,7 +154,7 @@ def validate(
     projected = estimate.camera.project(xyz_cam)
     tau_px = config.tau_px(constant.sigma_constant_px)
     tests = misfit_tests(estimate, correspondences, robust.noise if noise_name == "lidar" else None)
-    offset = pose_offset_px(residuals_px, projected.pose[3:].transpose(1, 0, 2), xyz_cam.T)
+    offset = pose_offset_px(residuals_px, projected.pose[3:].transpose(1, 0, 2), xyz_cam)
     camera = estimate.camera
     found = _Evidence(
         offset,

@@ -49,7 +49,7 @@ def lengths_after_pose_step(
     """
     with np.errstate(all="ignore"):
         jacobian = project_with_jacobians(camera.model, camera.params, xyz_cam, with_params=False).d_xy_d_cam
-        columns = pose_columns(jacobian.transpose(1, 2, 0), xyz_cam.T)
+        columns = pose_columns(jacobian.transpose(1, 2, 0), xyz_cam)
         used = np.isfinite(columns).all(axis=(0, 1))
         columns, target = columns[:, :, used], residuals_px[:, used]
         norms = np.sqrt((columns**2).sum(axis=(1, 2)))

@@ -167,7 +167,7 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
         constant,
         quality=quality,
         misfit=misfit,
-        retest=image_retest(part.xyz_cam.T, part.residuals_px),
+        retest=image_retest(part.xyz_cam, part.residuals_px),
     )
     return audit_image(evidence, config)
 

@@ -32,6 +32,7 @@ from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.quality import quality_of_images
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
 from sfm_audit.audit.engine.tables import ModelAudit, images_table, table_of
+from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
@@ -157,6 +158,7 @@ class ModelAuditor:
         """What the joint system says; None where nobody is asked, because the parts do not belong together."""
         if self.consistency.parts_disagree:
             return None
+        frames = claimed_frames(self.model)
         return audit_jointly(
             self.model,
             self.residuals,
@@ -165,6 +167,8 @@ class ModelAuditor:
             tau_px=self.tau_px,
             excluded=self.moved,
             left_out=self.consistency.inconsistent,
+            frame_idx=None if frames is None else frames.frame_idx,
+            image_from_frame=None if frames is None else frames.image_from_frame,
             points_independent=self.config.points == "independent",
         )
 

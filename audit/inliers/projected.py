@@ -63,7 +63,7 @@ class ImageInliers:
         model, params = self.camera.model, self.camera.params
         xy_px = np.subtract(self.xy_px.T, self.residuals_px, order="C")
         u = np.ascontiguousarray(normalised(model, params, self.xyz_cam).T)
-        pose = pose_columns(self.jacobian_cam, self.xyz_cam.T)
+        pose = pose_columns(self.jacobian_cam, self.xyz_cam)
         return ProjectedImage(xy_px, u, pose, _d_params(self.camera, xy_px, self.d_extra))
 
 
@@ -112,7 +112,7 @@ def inliers_of(image: ImageRecord, xy_px: FloatArray, xyz_world: FloatArray, par
         xy_px[rows],
         xyz_world[rows],
         part.residuals_px,
-        part.xyz_cam.T,
+        part.xyz_cam,
         part.jacobian_cam,
         part.d_extra,
     )
@@ -125,7 +125,7 @@ def project_image(camera: CameraRecord, xyz_cam: FloatArray) -> ProjectedImage:
     return ProjectedImage(
         projection.xy_px,
         np.ascontiguousarray(normalised(camera.model, camera.params, xyz_cam).T),
-        pose_columns(projection.d_xy_d_cam, xyz_cam.T),
+        pose_columns(projection.d_xy_d_cam, xyz_cam),
         cast("FloatArray", projection.d_xy_d_params),
     )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
+from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
 from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_sane, is_usable
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -18,7 +19,7 @@ class ImageResiduals:
     """The inliers among the linked points of one image, projected.
 
     inlier_row: (n,) their rows among the points given.          residuals_px: (2, n) observed - projected.
-    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (3, n).
+    jacobian_cam: (2, 3, n) d projection / d point in the camera frame, px per model unit.      xyz_cam: (n, 3).
     d_extra: (e, 2, n) d projection / d distortion parameters, px per unit.
     num_dangling, num_behind, num_nonfinite: points that are no inliers, by cause.
     num_unprojected: of num_nonfinite, those in front of the camera that have no finite projection.
@@ -46,7 +47,8 @@ class ModelResiduals:
 
     offsets: (I + 1,) image i owns columns offsets[i]:offsets[i + 1].    observation_row: (n,) rows of ObservationTable.
     point_idx: (n,) rows of PointTable.                                  residuals_px: (2, n) observed - projected.
-    point_jacobian: (2, 3, n) px per model unit, world frame.            pose_offset_px: (I,) NaN without inliers.
+    point_jacobian: (2, 3, n) px per model unit, world frame.            pose_offset_px: (I,) NaN without inliers;
+    of the whole frame where the model claims frames of several images.
     d_extra: per image, (e, 2, n_i) d projection / d distortion parameters, px per unit. With them everything else that
     a projection gives is cheap to have again: `audit.inliers.projected.image_inliers`.
     num_dangling, num_behind, num_nonfinite: (I,) linked observations that are no inliers, by cause.
@@ -113,7 +115,7 @@ def image_residuals(
         rows,
         residuals,
         jacobian,
-        xyz_cam.T if rows.size else np.empty((3, 0)),
+        xyz_cam if rows.size else np.empty((0, 3)),
         d_extra,
         num_dangling,
         num_behind,
@@ -177,10 +179,13 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite, part.num_unprojected
     total = offsets[-1]
     observation_row = observation_row[:total]
+    inlier_point = observations.point_idx if total == capacity else observations.point_idx[observation_row]
+    if (frames := claimed_frames(model)) is not None:
+        pose_offset = frame_offsets_px(model, frames, offsets, inlier_point, (residuals, jacobian))
     return ModelResiduals(
         offsets,
         observation_row,
-        observations.point_idx if total == capacity else observations.point_idx[observation_row],
+        inlier_point,
         residuals[:, :total],
         jacobian[:, :, :total],
         pose_offset,

@@ -17,13 +17,13 @@ def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
     Parameters
     ----------
     jacobian_cam : (2, 3, n) d projection / d point in the camera frame, px per model unit
-    xyz_cam : (3, n) points in the camera frame, model units
+    xyz_cam : (n, 3) points in the camera frame, model units
 
     Notes
     -----
     A rotation by the small vector w (rad) about the camera centre moves a point by w x Xc, a translation t by t.
     """
-    x, y, z = xyz_cam
+    x, y, z = xyz_cam.T
     jx, jy, jz = jacobian_cam.transpose(1, 0, 2)
     out = np.empty((6, *jx.shape))
     out[0] = jz * y - jy * z
@@ -35,7 +35,7 @@ def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
 
 def pose_jacobian(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
     """Return (n, 2, 6): `pose_columns` with points first, of (n, 2, 3) and (n, 3)."""
-    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam.T).transpose(2, 1, 0)
+    return pose_columns(jacobian_cam.transpose(1, 2, 0), xyz_cam).transpose(2, 1, 0)
 
 
 def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: FloatArray) -> float:
@@ -50,10 +50,15 @@ def pose_offset_px(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: 
     float
         px; NaN without observations. A bundle-adjusted image has ~0, a pose changed afterwards 1..3.
     """
+    return offset_px(pose_columns(jacobian_cam, xyz_cam), residuals_px)
+
+
+def offset_px(columns: FloatArray, residuals_px: FloatArray) -> float:
+    """Return the same of any six pose columns (6, 2, n) and residuals (2, n): of an image, or of a frame of images."""
     n = residuals_px.shape[1]
     if n == 0:
         return math.nan
-    columns = pose_columns(jacobian_cam, xyz_cam).reshape(6, 2 * n)
+    columns = columns.reshape(6, 2 * n)
     gram = columns @ columns.T
     if not np.isfinite(gram).all():  # at the poles of a panorama: such a point does not move the pose
         columns = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)

@@ -112,7 +112,7 @@ def _next(system: JointSystem, model: SparseModel, residuals: ModelResiduals) ->
         return None
     reduced, _ = reduced_systems(observations)
     inverse = system.base.inverse
-    front = sparse_linalg.LinearOperator(reduced.matrix.shape, matvec=lambda x: inverse.main @ x)
+    front = sparse_linalg.LinearOperator(reduced.matrix.shape, matvec=inverse.main.apply)
     step, _ = sparse_linalg.cg(reduced.matrix, reduced.right, M=front, rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS)
     left = observations.residuals_px()
     padded = np.append(step, 0.0)

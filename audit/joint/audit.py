@@ -11,7 +11,7 @@ import numpy as np
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
-from sfm_audit.audit.joint.implied import ImpliedParameter, implied_parameters
+from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_parameters
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
 from sfm_audit.audit.joint.system import JointSystem, joint_system
@@ -88,21 +88,23 @@ def audit_jointly(
 def _of_block(
     system: JointSystem, block: Block, alpha: float, tau_px: FloatArray, excluded: BoolArray | None
 ) -> tuple[Block, JointAudit]:
-    steps = own_parameters(system)
+    core = np.flatnonzero(block.core).tolist()
+    covariance_of = dict(zip(core, system.image_covariances(core), strict=True))
+    steps = own_parameters(system, covariance_of)
     out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
     material = [step for step in steps if step.is_material(float(np.median(tau_px[step.image_idxs])))]
     for step in material:
         out[step.image_idxs] = True
     settled = {step.camera_idx: step for step in implied_again(system, material)}
     steps = tuple(settled.get(step.camera_idx, step) for step in steps)
-    implied = implied_parameters(system, steps)
-    core = np.flatnonzero(block.core).tolist()
     gains = [Gains(math.nan, math.nan, math.nan)] * len(block.core)
     covariances = [np.zeros((0, 0))] * len(block.core)
-    for image, covariance in zip(core, system.image_covariances(core), strict=True):
+    for image, covariance in covariance_of.items():
         gains[image], covariances[image] = image_gains(system, image), covariance
     counts = np.diff(system.observations.offsets)
-    misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out)
+    beside = ImpliedBeside(system, steps)
+    misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)
+    implied = implied_parameters(system, steps, beside.found)
     return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, counts, 1)
 
 

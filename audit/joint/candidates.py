@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
+from sfm_audit.audit.joint.observations import design_crossed, design_scores
 from sfm_audit.audit.joint.system import Base, IncludedFields
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -31,6 +33,18 @@ class CandidateScores:
     support: IntArray
     solution: FloatArray
     num_observations: int
+
+    def only(self, columns: slice) -> CandidateScores:
+        """Return some of the fields; each was projected off the base alone, so that nothing else changes."""
+        return replace(
+            self,
+            sq_length=self.sq_length[columns],
+            gram=self.gram[columns, columns],
+            score=self.score[columns],
+            track_score=self.track_score[:, columns],
+            coupling=self.coupling[:, columns],
+            solution=self.solution[:, columns],
+        )
 
 
 class ImageFields(NamedTuple):
@@ -65,15 +79,16 @@ def candidate_scores(base: Base, images: Sequence[int], fields_of: Callable[[int
     sq_length, count = gram.diagonal().copy(), len(gram)
     absorbed = base.point_inverse[points] @ crossed
     gram -= crossed.reshape(-1, count).T @ absorbed.reshape(-1, count)
+    view_scores: list[FloatArray | None] = []
     if not observations.points_independent:
         for part, around in chunks:
-            coupling.subtract_tracks(right, around, absorbed[part])
+            view_scores.append(coupling.subtract_tracks(right, around, absorbed[part], keep=len(chunks) == 1))
     solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
     score = track_score.sum(axis=0)
     padded = np.vstack([solution, np.zeros((1, count))])
-    for part, around in chunks:
-        track_score[part] -= coupling.scores(around, padded)
+    for (part, around), known in zip_longest(chunks, view_scores):
+        track_score[part] -= coupling.scores(around, padded, known)
     num_observations = sum(observations.num_of(image) for image in images)
     gram = 0.5 * (gram + gram.T)
     return CandidateScores(
@@ -158,9 +173,14 @@ class _Coupling:
         if extra is not None:
             right[self._place[extra.columns]] += extra.fields.reshape(len(weighted), -1).T @ weighted
 
-    def subtract_tracks(self, right: FloatArray, around: Neighbourhood, absorbed: FloatArray) -> None:
-        """Subtract W V^-1 J^T E, in place; ``absorbed`` (T, 3, c) is V^-1 J^T E."""
-        shared = around.gather(self._base.observations.crossed[around.views], absorbed)
+    def subtract_tracks(
+        self, right: FloatArray, around: Neighbourhood, absorbed: FloatArray, *, keep: bool
+    ) -> FloatArray | None:
+        """Subtract W V^-1 J^T E, in place; ``absorbed`` (T, 3, c) is V^-1 J^T E. Return the views' scores to keep."""
+        observations = self._base.observations
+        design, weight = observations.weighted(around.views)
+        shared = around.gather(design_crossed(design, weight), absorbed)
+        shared = observations.transform[around.images].transpose(0, 2, 1) @ shared
         places = self._places(around.images)
         if np.unique(places).size == places.size:
             right[places] -= shared
@@ -170,12 +190,17 @@ class _Coupling:
             seen = absorbed[around.track[own]].reshape(-1, absorbed.shape[2])
             crossed = extra.crossed[within].transpose(1, 0, 2).reshape(extra.columns.size, -1)
             right[self._place[extra.columns]] -= crossed @ seen
+        return design_scores(design, weight, self._base.left_px[around.views]) if keep else None
 
-    def scores(self, around: Neighbourhood, solution: FloatArray) -> FloatArray:
-        """(T, c) sum over the views of each track of B_k^T h_k; ``solution`` (s + 1, c) is B and a row of zeros."""
-        base = self._base
-        per_view = base.view_scores[around.by_track]
-        out = around.scatter(per_view, solution[self._places(around.images)])
+    def scores(self, around: Neighbourhood, solution: FloatArray, known: FloatArray | None) -> FloatArray:
+        """(T, c) sum over the views of each track of B_k^T h_k; ``solution`` (s + 1, c) is B and a row of zeros.
+
+        ``known``: the views' scores where they are at hand.
+        """
+        base, observations = self._base, self._base.observations
+        per_view = observations.scores(around.views, base.left_px) if known is None else known
+        moved = observations.transform[around.images] @ solution[self._places(around.images)]
+        out = around.scatter(per_view, moved)
         for extra, own, within in self._included_near(around):
             views = around.views[own]
             left = base.left_px[views] * base.observations.weight[views, None]

@@ -6,7 +6,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from sfm_audit.audit.joint.layout import NUM_POSE, cross_matrix
+from sfm_audit.audit.inliers.frames import cross_matrix
+from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.observations import JointObservations
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -68,41 +69,100 @@ class ImpliedParameter:
     found: bool
 
 
-def implied_parameters(system: JointSystem, steps: tuple[CameraStep, ...]) -> list[ImpliedParameter]:
+class ImpliedBeside:
+    """Asks for the missing parameters of cameras with a single image along with the misfit test of that image.
+
+    One projection off the base then serves both: see `sfm_audit.audit.joint.misfit.Beside`.
+    """
+
+    def __init__(self, system: JointSystem, steps: tuple[CameraStep, ...]) -> None:
+        self._system = system
+        self._asked = {
+            int(step.image_idxs[0]): _asked_of(system, step)
+            for step in steps
+            if len(step.image_idxs) == 1 and _can_lack(system, step)
+        }
+        self.found: dict[int, list[ImpliedParameter]] = {}
+
+    def fields(
+        self, image_idx: int, camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray
+    ) -> FloatArray:
+        """(6, 2, n) the columns of the image's camera; none of cameras with several images."""
+        if image_idx not in self._asked:
+            return candidates[:0]
+        return _missing_columns(camera, projected, candidates)
+
+    def take(self, image_idx: int, scores: CandidateScores) -> None:
+        """Note what the columns would be."""
+        asked = self._asked.get(image_idx)
+        if asked is not None and asked.camera_idx is not None:
+            self.found[asked.camera_idx] = _implied(self._system, asked, scores)
+
+
+def implied_parameters(
+    system: JointSystem,
+    steps: tuple[CameraStep, ...],
+    found: Mapping[int, list[ImpliedParameter]] | None = None,
+) -> list[ImpliedParameter]:
     """Return what every camera's missing parameters would be, then a principal point common to each image size.
 
     Parameters
     ----------
-    steps : of `own_parameters`
+    steps : of `own_parameters`        found : by camera, what is known already (`ImpliedBeside`)
     """
+    found = {} if found is None else found
     out: list[ImpliedParameter] = []
     by_size: dict[tuple[int, int], list[CameraStep]] = {}
     for camera in steps:
-        record = system.model.camera(camera.camera_idx)
-        if record.model.is_spherical or not camera.num_observations:
+        if not _can_lack(system, camera):
             continue
-        by_size.setdefault((record.width, record.height), []).append(camera)
-        out += _of_images(system, camera.image_idxs, record, camera.camera_idx, camera.sd_focal_rel)
+        asked = _asked_of(system, camera)
+        by_size.setdefault((asked.camera.width, asked.camera.height), []).append(camera)
+        out += found[camera.camera_idx] if camera.camera_idx in found else _of_images(system, asked)
     for cameras in by_size.values():
         if len(cameras) > 1:
             record = system.model.camera(cameras[0].camera_idx)
             images = np.sort(np.concatenate([camera.image_idxs for camera in cameras]))
             sd_focal_rel = float(np.median([camera.sd_focal_rel for camera in cameras]))
-            out += _of_images(system, images, record, None, sd_focal_rel)
+            out += _of_images(system, _Asked(images, record, None, sd_focal_rel))
     return out
+
+
+class _Asked(NamedTuple):
+    """Whose parameters: images, the camera (one of them), its row or None for all of one size, sd_f / f."""
+
+    images: IntArray
+    camera: CameraRecord
+    camera_idx: int | None
+    sd_focal_rel: float
+
+
+def _can_lack(system: JointSystem, step: CameraStep) -> bool:
+    return bool(step.num_observations) and not system.model.camera(step.camera_idx).model.is_spherical
+
+
+def _asked_of(system: JointSystem, step: CameraStep) -> _Asked:
+    camera = system.model.camera(step.camera_idx)
+    images = step.image_idxs[np.diff(system.observations.offsets)[step.image_idxs] > 0]
+    return _Asked(images, camera, step.camera_idx, step.sd_focal_rel)
 
 
 def _missing_fields(system: JointSystem, image: int) -> ImageFields:
     """Six columns, px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
     inliers = system.observations.inliers(image)
     camera, projected = inliers.camera, inliers.projected
-    fields = candidate_fields(camera, projected)
-    out = np.zeros((6, *fields.shape[1:]))
+    out = _missing_columns(camera, projected, candidate_fields(camera, projected))
+    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image))
+
+
+def _missing_columns(camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray) -> FloatArray:
+    """(6, 2, n), see `_missing_fields`; ``candidates`` of `candidate_fields`."""
+    out = np.zeros((6, *candidates.shape[1:]))
     out[0, 0], out[1, 1] = 1.0, 1.0
     out[2] = _next_radial(camera, projected)
-    out[3] = fields[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
-    out[4:] = fields[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
-    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, projected))
+    out[3] = candidates[GROUP_COLUMNS[MisfitGroup.AFFINE]][0]
+    out[4:] = candidates[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]]
+    return out
 
 
 def _shift_fields(system: JointSystem, image: int) -> ImageFields:
@@ -134,16 +194,15 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
     return out
 
 
-def _of_images(
-    system: JointSystem,
-    image_idxs: IntArray,
-    camera: CameraRecord,
-    camera_idx: int | None,
-    sd_focal_rel: float,
-) -> list[ImpliedParameter]:
-    images = image_idxs[np.diff(system.observations.offsets)[image_idxs] > 0]
-    fields_of = partial(_missing_fields if camera_idx is not None else _shift_fields, system)
-    scores = candidate_scores(system.base, images.tolist(), fields_of)
+def _of_images(system: JointSystem, asked: _Asked) -> list[ImpliedParameter]:
+    images = asked.images[np.diff(system.observations.offsets)[asked.images] > 0]
+    fields_of = partial(_missing_fields if asked.camera_idx is not None else _shift_fields, system)
+    return _implied(system, asked._replace(images=images), candidate_scores(system.base, images.tolist(), fields_of))
+
+
+def _implied(system: JointSystem, asked: _Asked, scores: CandidateScores) -> list[ImpliedParameter]:
+    """What each parameter would be, from the scores of all their columns."""
+    images, camera, camera_idx, sd_focal_rel = asked
     sigma_px = float(np.median(system.observations.sigma_px[images]))
     out = []
     for parameter, names, unit in _lacking(camera):

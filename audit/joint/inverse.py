@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
+from sfm_audit.audit.joint.banded import Band, BandedFactor, band_of, banded_factor, banded_inverse
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal
@@ -20,17 +21,76 @@ _INVERSE_ITERATIONS: Final = 6
 _IN_NULL: Final = 1e-6  # squared length of a parameter in null directions from which on it is not identified
 
 
+class SymmetricInverse(Protocol):
+    """S^+ (D, D), however it is held."""
+
+    def __len__(self) -> int:
+        """D."""
+        ...
+
+    def apply(self, right: FloatArray) -> FloatArray:
+        """S^+ right, of (D,) or (D, c)."""
+        ...
+
+    def times(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """S^+ (all rows, at some columns) @ right: (D, c) of (k, c)."""
+        ...
+
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        ...
+
+    def rows(self, columns: IntArray) -> FloatArray:
+        """(k, D) rows of S^+."""
+        ...
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """(k, k) entries of S^+ at some columns."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DenseInverse:
+    """S^+ as an array (D, D)."""
+
+    array: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def apply(self, right: FloatArray) -> FloatArray:
+        """S^+ right, of (D,) or (D, c)."""
+        return np.asarray(self.array @ right)
+
+    def times(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """S^+ (all rows, at some columns) @ right: (D, c) of (k, c)."""
+        main = self.array if columns.size == len(self.array) else self.array[columns].T
+        return np.asarray(main @ right)
+
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        return np.asarray(self.block(columns) @ right)
+
+    def rows(self, columns: IntArray) -> FloatArray:
+        """(k, D) rows of S^+."""
+        return self.array[columns]
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """(k, k) entries of S^+ at some columns."""
+        return self.array[np.ix_(columns, columns)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointInverse:
     """S^+ of the base system and, behind its D columns, of what was included since.
 
-    main: (D, D) of the base system alone; inclusion adds update update^T to it.
+    main: of the base system alone; inclusion adds update update^T to it.
     update: (D, k).    border: (D, m).    corner: (m, m).
     unidentified: (D,) parameters without effect, or with a share in a null direction that is no gauge.
     num_null: further null directions found.
     """
 
-    main: FloatArray
+    main: SymmetricInverse
     update: FloatArray
     border: FloatArray
     corner: FloatArray
@@ -50,7 +110,7 @@ class JointInverse:
         head, tail = right[: base.size], right[base.size :]
         update = self.update[base]
         border = self.border[np.ix_(base, extra)]
-        above = self.main[np.ix_(base, base)] @ head + update @ (update.T @ head) + border @ tail
+        above = self.main.within(base, head) + update @ (update.T @ head) + border @ tail
         return np.vstack([above, border.T @ head + self.corner[np.ix_(extra, extra)] @ tail])
 
     def _split(self, support: IntArray) -> tuple[IntArray, IntArray]:
@@ -62,8 +122,7 @@ class JointInverse:
         """Return S^+ (all rows, at some sorted columns) @ right: (D + m, c) of (s, c)."""
         base, extra = self._split(support)
         head, tail = right[: base.size], right[base.size :]
-        main = self.main if base.size == len(self.main) else self.main[base].T
-        above = main @ head + self.update @ (self.update[base].T @ head) + self.border[:, extra] @ tail
+        above = self.main.times(base, head) + self.update @ (self.update[base].T @ head) + self.border[:, extra] @ tail
         below = self.border[base].T @ head + self.corner[:, extra] @ tail
         return np.vstack([above, below])
 
@@ -103,49 +162,63 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     size = matrix.shape[0]
     nothing = np.zeros((size, 0))
     if not size:
-        return JointInverse(np.zeros((0, 0)), nothing, nothing, np.zeros((0, 0)), np.zeros(0, dtype=bool), 0)
+        return JointInverse(
+            DenseInverse(np.zeros((0, 0))), nothing, nothing, np.zeros((0, 0)), np.zeros(0, dtype=bool), 0
+        )
     diagonal = matrix.diagonal()
     dead = diagonal <= _DEAD * before
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
     free = _orthonormal(gauge, scale, dead, matrix)
+    scaled = _scaled(matrix, scale, dead)
+    band = band_of(scaled)
     deflated, further = free, free[:, :0]
     while True:
-        factor = _factor(matrix, scale, dead, deflated)
-        found = _null_directions(factor, deflated)
+        factor = _factor(scaled, deflated, band)
+        found = _null_directions(factor, size)
         if not found.shape[1]:
             break
         further = np.hstack([further, found])
         deflated = np.hstack([deflated, found])
         if further.shape[1] >= _MAX_NULL:
             break
-    inverse, _ = lapack.dpotri(factor.array, lower=1, overwrite_c=1)
-    _finish(inverse, deflated, scale, dead)
+    inverse_scale = np.where(dead, 0.0, 1.0 / scale)
     lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
-    return JointInverse(inverse.T, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
+    main: SymmetricInverse
+    if isinstance(factor, BandedFactor):
+        main = banded_inverse(factor, inverse_scale)
+    else:
+        main = _dense_inverse(factor, deflated, inverse_scale)
+    return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Factor:
+class _DenseFactor:
     """Lower Cholesky factor (D, D) of S + Z Z^T + shift I, unit diagonal of S."""
 
     array: FloatArray
+    deflated: FloatArray
     shift: float
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """(D, c)."""
+        """(D, c), off Z."""
         out, _ = lapack.dpotrs(self.array, right, lower=1)
-        return np.asarray(out)
+        return np.asarray(out - self.deflated @ (self.deflated.T @ out))
 
 
-def _dense(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> FloatArray:
-    """S with unit diagonal plus Z Z^T; 1 on the diagonal of dead columns. In Fortran order, for LAPACK."""
+def _scaled(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray) -> sparse.csr_array:
+    """S with unit diagonal; of dead columns nothing but that."""
     data = matrix.data / scale[matrix.indices] / np.repeat(scale, np.diff(matrix.indptr))
-    scaled = sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
-    out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
     if dead.any():
-        out[dead] = 0.0
-        out[:, dead] = 0.0
-        out[dead, dead] = 1.0
+        row = np.repeat(np.arange(len(dead)), np.diff(matrix.indptr))
+        data = np.where(dead[row] | dead[matrix.indices], np.where(row == matrix.indices, 1.0, 0.0), data)
+    out = sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+    missing = dead & (out.diagonal() == 0)
+    return sparse.csr_array(out + sparse.diags_array(missing.astype(np.float64))) if missing.any() else out
+
+
+def _dense(scaled: sparse.csr_array, deflated: FloatArray) -> FloatArray:
+    """S plus Z Z^T, in Fortran order, for LAPACK."""
+    out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
     if deflated.shape[1]:
         _add_outer(out, deflated, 1.0)
     return np.asarray(out)
@@ -158,15 +231,20 @@ def _add_outer(out: FloatArray, columns: FloatArray, sign: float) -> None:
         out[:, part] += sign * (columns @ columns[part].T)
 
 
-def _factor(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray, deflated: FloatArray) -> _Factor:
+def _factor(scaled: sparse.csr_array, deflated: FloatArray, band: Band | None) -> BandedFactor | _DenseFactor:
+    banded = banded_factor(scaled, band, deflated) if band else None
+    return banded or _dense_factor(scaled, deflated)
+
+
+def _dense_factor(scaled: sparse.csr_array, deflated: FloatArray) -> _DenseFactor:
     shift = 0.0
     while True:
-        array = _dense(matrix, scale, dead, deflated)
+        array = _dense(scaled, deflated)
         if shift:
             array[np.diag_indices(len(array))] += shift
         factor, info = lapack.dpotrf(array, lower=1, overwrite_a=1, clean=0)
         if info == 0:
-            return _Factor(factor, shift)
+            return _DenseFactor(factor, deflated, shift)
         shift = max(_SHIFT, 10.0 * shift)
 
 
@@ -184,16 +262,14 @@ def _orthonormal(gauge: FloatArray, scale: FloatArray, dead: BoolArray, matrix: 
     return np.asarray(left @ vectors[:, values < _GAUGE_EIGENVALUE])
 
 
-def _null_directions(factor: _Factor, deflated: FloatArray) -> FloatArray:
+def _null_directions(factor: BandedFactor | _DenseFactor, size: int) -> FloatArray:
     """(D, k) orthonormal directions with an eigenvalue below the threshold, by block inverse iteration."""
-    size = len(factor.array)
     rng = np.random.default_rng(0)
     count = min(8, size)
     while True:
         block = np.linalg.qr(rng.normal(size=(size, count)))[0]
         for _ in range(_INVERSE_ITERATIONS):
-            solved = factor.solve(block)
-            block = np.linalg.qr(solved - deflated @ (deflated.T @ solved))[0]
+            block = np.linalg.qr(factor.solve(block))[0]
         values, vectors = np.linalg.eigh(block.T @ factor.solve(block))
         null = 1.0 / np.maximum(values, 1e-300) - factor.shift < NULL_EIGENVALUE
         if not null.all() or count >= min(size, _MAX_NULL):
@@ -201,8 +277,9 @@ def _null_directions(factor: _Factor, deflated: FloatArray) -> FloatArray:
         count = min(size, 4 * count)
 
 
-def _finish(inverse: FloatArray, deflated: FloatArray, scale: FloatArray, dead: BoolArray) -> None:
-    """From the lower triangle of the scaled, deflated inverse to S^+, in place."""
+def _dense_inverse(factor: _DenseFactor, deflated: FloatArray, inverse_scale: FloatArray) -> DenseInverse:
+    """From the factor of the scaled, deflated matrix to S^+, in the factor's memory."""
+    inverse, _ = lapack.dpotri(factor.array, lower=1, overwrite_c=1)
     size = len(inverse)
     for start in range(0, size, 512):
         stop = min(start + 512, size)
@@ -211,8 +288,6 @@ def _finish(inverse: FloatArray, deflated: FloatArray, scale: FloatArray, dead: 
         inverse[start:stop, stop:] = inverse[stop:, start:stop].T
     if deflated.shape[1]:
         _add_outer(inverse, deflated, -1.0)
-    inverse /= scale[:, None]
-    inverse /= scale
-    if dead.any():
-        inverse[dead] = 0.0
-        inverse[:, dead] = 0.0
+    inverse *= inverse_scale[:, None]
+    inverse *= inverse_scale
+    return DenseInverse(inverse.T)

@@ -113,22 +113,3 @@ def _numbered(first_of_frame: IntArray, camera_idx: IntArray, counts: IntArray) 
     starts = np.empty(len(widths), dtype=np.int64)
     starts[order] = np.cumsum(widths[order]) - widths[order]
     return starts[:num_frames], starts[num_frames:], int(widths.sum())
-
-
-def image_from_frame(rotation_sensor_from_rig: FloatArray, translation_sensor_from_rig: FloatArray) -> FloatArray:
-    """Return (6, 6): what moving a frame does to the pose of one of its images.
-
-    Notes
-    -----
-    Left perturbations: Xc' = Xc + w x Xc + t. With Xc = R_s Xr + t_s: w_c = R_s w, t_c = R_s t + t_s x (R_s w).
-    """
-    out = np.zeros((NUM_POSE, NUM_POSE))
-    out[:3, :3] = out[3:, 3:] = rotation_sensor_from_rig
-    out[3:, :3] = cross_matrix(translation_sensor_from_rig) @ rotation_sensor_from_rig
-    return out
-
-
-def cross_matrix(vector: FloatArray) -> FloatArray:
-    """(3, 3) matrix [v] with [v] a = v x a."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
+from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
-from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.model import CameraRecord
 
 MAX_ROUNDS: Final = 8
 _INCLUDE_FROM_PX: Final = 0.1
@@ -68,8 +70,27 @@ class JointMisfit:
     most_are_wrong: bool
 
 
+class Beside(Protocol):
+    """Who wants other fields of an image projected off the base as it was before anything was included."""
+
+    def fields(
+        self, image_idx: int, camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray
+    ) -> FloatArray:
+        """(c, 2, n) px per unit; ``candidates`` of `candidate_fields`."""
+        ...
+
+    def take(self, image_idx: int, scores: CandidateScores) -> None:
+        """Hear what these fields would take up."""
+        ...
+
+
 def joint_misfit(
-    system: JointSystem, *, alpha: float, tau_px: FloatArray, excluded: BoolArray | None = None
+    system: JointSystem,
+    *,
+    alpha: float,
+    tau_px: FloatArray,
+    excluded: BoolArray | None = None,
+    beside: Beside | None = None,
 ) -> JointMisfit:
     """Test all images against everything that was or could be fitted, and free the fields of those that fail.
 
@@ -79,6 +100,7 @@ def joint_misfit(
     excluded : (I,) images that are wrong in another way (pose, own parameters). They keep their free pose and own
         parameters, so that they pull at nobody, but are neither tested nor counted. Ignored if they are more than
         half of the images with columns: then it is not they that are wrong.
+    beside : asked once for every image that is tested
 
     Notes
     -----
@@ -94,7 +116,7 @@ def joint_misfit(
     left_out = np.zeros_like(has_columns) if excluded is None else excluded & has_columns
     if 2 * np.count_nonzero(left_out) > np.count_nonzero(has_columns):
         left_out = np.zeros_like(has_columns)
-    rounds = _Rounds(system, has_columns & ~left_out, alpha=alpha, tau_px=tau_px)
+    rounds = _Rounds(system, has_columns & ~left_out, alpha=alpha, tau_px=tau_px, beside=beside)
     rounds.tests = [_nothing(has_columns[i], left_out[i]) for i in range(len(has_columns))]
     return rounds.run()
 
@@ -107,10 +129,12 @@ def _nothing(has_columns: bool, left_out: bool) -> dict[MisfitGroup, GroupTest]:
 class _Rounds:
     """Where inclusion stands."""
 
-    def __init__(self, system: JointSystem, tested: BoolArray, *, alpha: float, tau_px: FloatArray) -> None:
+    def __init__(
+        self, system: JointSystem, tested: BoolArray, *, alpha: float, tau_px: FloatArray, beside: Beside | None
+    ) -> None:
         num_images = len(tested)
         self._system, self._base = system, system.base
-        self._tested, self._alpha = tested, alpha
+        self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
         self.tests: list[dict[MisfitGroup, GroupTest]] = []
@@ -121,6 +145,7 @@ class _Rounds:
     def run(self) -> JointMisfit:
         """Test, include, test again."""
         self._test(self._tested)
+        self._beside = None  # from here on the base may be another
         num_tested = np.count_nonzero(self._tested)
         for number in range(MAX_ROUNDS):
             waiting = np.where(self._round < 0, self._effects(), 0.0)
@@ -141,9 +166,14 @@ class _Rounds:
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
 
     def _scores(self, image: int) -> CandidateScores | None:
-        fields = _fields_of(self._system, image)
-        usable = bool(fields.fields.size)
-        return candidate_scores(self._base, [image], lambda _: fields) if usable else None
+        fields = _fields_of(self._system, image, self._beside)
+        if not fields.fields.size:
+            return None
+        scores = candidate_scores(self._base, [image], lambda _: fields)
+        if self._beside is None:
+            return scores
+        self._beside.take(image, scores.only(slice(NUM_FIELDS, None)))
+        return scores.only(slice(0, NUM_FIELDS))
 
     def _significant(self, image: int) -> list[MisfitGroup]:
         return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
@@ -200,12 +230,15 @@ class _Rounds:
         return max(material or significant, key=lambda group: tests[group].bic(n), default=None)
 
 
-def _fields_of(system: JointSystem, image: int) -> ImageFields:
-    """42 candidate fields of an image, px per unit; none of panoramas."""
+def _fields_of(system: JointSystem, image: int, beside: Beside | None = None) -> ImageFields:
+    """42 candidate fields of an image, px per unit, and those of ``beside``; none of panoramas."""
     inliers = system.observations.inliers(image)
     camera, projected = inliers.camera, inliers.projected
-    fields = np.ascontiguousarray(candidate_fields(camera, projected).transpose(2, 1, 0))
-    return ImageFields(fields, system.observations.nuisance(image, projected))
+    candidates = candidate_fields(camera, projected)
+    if beside is not None and len(candidates):
+        candidates = np.concatenate([candidates, beside.fields(image, camera, projected, candidates)])
+    fields = np.ascontiguousarray(candidates.transpose(2, 1, 0))
+    return ImageFields(fields, system.observations.nuisance(image))
 
 
 def _image_tests(

@@ -21,8 +21,8 @@ class Neighbourhood:
 
     points: (T,).      images: (m,) who sees any of them.    starts: (m + 1,) views of image k: starts[k]:starts[k + 1].
     views: (v,) rows of the observations, by image.    track: (v,) which of the points each shows.
-    by_track: (v,) the same rows by track.    image_of: (v,) of these, which of the images.
-    ends: (T + 1,) views of track t are by_track[ends[t]:ends[t + 1]].
+    order: (v,) where each view stands by track.    image_of: (v,) by track, which of the images.
+    ends: (T + 1,) by track, the views of track t are those from ends[t] to ends[t + 1].
     """
 
     points: IntArray
@@ -30,9 +30,25 @@ class Neighbourhood:
     starts: IntArray
     views: IntArray
     track: IntArray
-    by_track: IntArray
+    order: IntArray
     image_of: IntArray
     ends: IntArray
+
+    def from_image(self, image_idx: int) -> Neighbourhood:
+        """Return the views of an image and of those behind it; in the order by image only."""
+        k = int(np.searchsorted(self.images, image_idx))
+        start = self.starts[k]
+        none = np.zeros(0, dtype=np.int64)
+        return Neighbourhood(
+            self.points,
+            self.images[k:],
+            self.starts[k:] - start,
+            self.views[start:],
+            self.track[start:],
+            order=none,
+            image_of=none,
+            ends=none,
+        )
 
     def segments(self) -> Iterator[tuple[int, slice]]:
         """Each image with its views."""
@@ -60,12 +76,14 @@ class Neighbourhood:
 
         Parameters
         ----------
-        per_view : (v, C), by track        per_image : (m, C, c)
+        per_view : (v, C), by image        per_image : (m, C, c)
         """
+        by_track = np.empty_like(per_view)
+        by_track[self.order] = per_view
         width = per_view.shape[1]
         indices = (width * self.image_of[:, None] + np.arange(width, dtype=np.int32)).astype(np.int32)
         matrix = sparse.csr_array(
-            (per_view.reshape(-1), indices.reshape(-1), (width * self.ends).astype(np.int32)),
+            (by_track.reshape(-1), indices.reshape(-1), (width * self.ends).astype(np.int32)),
             shape=(len(self.points), width * len(self.images)),
         )
         return np.asarray(matrix @ per_image.reshape(-1, per_image.shape[2]))
@@ -87,7 +105,7 @@ def neighbourhood(observations: JointObservations, points: IntArray) -> Neighbou
     small = image_of.astype(np.uint16) if len(images) < 2**16 else image_of  # sorted by radix
     order = np.argsort(small, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(image_of, minlength=len(images)))])
-    return Neighbourhood(points, images, starts, by_track[order], track[order], by_track, image_of, ends)
+    return Neighbourhood(points, images, starts, by_track[order], track[order], order, image_of, ends)
 
 
 def point_chunks(observations: JointObservations, points: IntArray) -> Iterator[slice]:
@@ -101,8 +119,10 @@ def point_chunks(observations: JointObservations, points: IntArray) -> Iterator[
 
 def sum_by_track(values: FloatArray, track: IntArray, num_tracks: int) -> FloatArray:
     """Return (T, ...): sums of the values (n, ...) that belong to each track."""
-    if values.shape[0] == num_tracks and bool((track == np.arange(num_tracks)).all()):
-        return values
+    if values.shape[0] == num_tracks:  # every track once
+        out = np.empty(values.shape)
+        out[track] = values
+        return out
     flat = values.reshape(values.shape[0], -1)
     selector = sparse.csr_array((np.ones(track.size), (track, np.arange(track.size))), shape=(num_tracks, track.size))
     return np.asarray(selector @ flat).reshape(num_tracks, *values.shape[1:])

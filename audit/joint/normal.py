@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from sfm_audit.audit.joint.neighbourhood import neighbourhood, sum_by_track
-from sfm_audit.audit.joint.observations import JointObservations, point_information
+from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
@@ -27,7 +27,7 @@ class ReducedSystem:
 
 
 def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
-    """Assemble (6) with the robust weights and with w = 1; fills ``observations.crossed``."""
+    """Assemble (6) with the robust weights and with w = 1."""
     weights = observations.weight, observations.plain_weight
     inverses = [_point_inverse(observations, weight) for weight in weights]
     values_px = observations.residuals_px()
@@ -38,14 +38,12 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
     for image in observations.used_images:
         rows, columns = observations.rows(image), layout.columns[image]
         own = observations.nuisance(image)
-        jacobian = observations.jacobian(image) * observations.weight[rows, None, None]
-        np.matmul(jacobian.transpose(0, 2, 1), own, out=observations.crossed[rows])
         for k, weight in enumerate(weights):
             weighted = (own * weight[rows, None, None]).reshape(-1, layout.width)
             gram = weighted.T @ own.reshape(-1, layout.width)
             np.add.at(right[k], columns, cleaned[k][rows].reshape(-1) @ weighted)
             np.add.at(before[k], columns, gram.diagonal())
-            blocks[k].add(columns, columns[None], gram[None])
+            blocks[k].add(columns, columns[None], 0.5 * gram[None])
     if not observations.points_independent:
         _eliminate_points(observations, inverses, blocks)
     robust, plain = (
@@ -57,40 +55,42 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
 def _eliminate_points(
     observations: JointObservations, inverses: list[FloatArray], blocks: tuple[_Blocks, _Blocks]
 ) -> None:
-    """Subtract sum W V^-1 W^T, image by image; only images that share points with it have an entry."""
-    layout = observations.layout
+    """Subtract half of sum W V^-1 W^T, image by image: each pair of images that share points once."""
+    layout, transform = observations.layout, observations.transform
     to_plain = observations.plain_weight / observations.weight
     for image in observations.used_images:
-        rows = observations.rows(image)
-        points, track = np.unique(observations.point_idx[rows], return_inverse=True)
-        around = neighbourhood(observations, points)
-        crossed = observations.crossed[around.views]
-        own = observations.crossed[rows]
+        points = np.unique(observations.point_idx[observations.rows(image)])
+        around = neighbourhood(observations, points).from_image(image)
+        track = around.track[: around.starts[1]]  # its own views come first
+        crossed = design_crossed(*observations.weighted(around.views))
         columns, others = layout.columns[image], layout.columns[around.images]
         for k, inverse in enumerate(inverses):
             if k == 1:
                 crossed *= to_plain[around.views, None, None]
-                own = own * to_plain[rows, None, None]
-            eliminated = inverse[points] @ sum_by_track(own, track, points.size)  # V^-1 W^T
-            slab = around.gather(crossed, eliminated)
+            own = sum_by_track(crossed[: len(track)] @ transform[image], track, points.size)
+            eliminated = inverse[points] @ own  # V^-1 W^T
+            slab = transform[around.images].transpose(0, 2, 1) @ around.gather(crossed, eliminated)
+            slab[0] *= 0.5
             blocks[k].add(columns, others, -slab.transpose(0, 2, 1))
 
 
-def score_meat(observations: JointObservations, score: FloatArray) -> sparse.csr_array:
+def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.csr_array:
     """Return M (D, D): sum over tracks of g_t g_t^T, with g_t the score of the base system from track t.
 
     Parameters
     ----------
-    score : (n, C) w N^T y~, with y~ the residuals after the step; they are off J, so g_t is its sum over the views
+    left_px : (n, 2) y~, the residuals after the step; they are off J, so g_t is the sum of w N^T y~ over the views
     """
-    layout = observations.layout
+    layout, transform = observations.layout, observations.transform
     blocks = _Blocks(layout.num_columns)
     for image in observations.used_images:
-        rows = observations.rows(image)
-        points, track = np.unique(observations.point_idx[rows], return_inverse=True)
-        around = neighbourhood(observations, points)
-        own = sum_by_track(score[rows], track, points.size)
-        slab = around.gather(score[around.views, None, :], own[:, None, :])
+        points = np.unique(observations.point_idx[observations.rows(image)])
+        around = neighbourhood(observations, points).from_image(image)
+        track = around.track[: around.starts[1]]
+        score = observations.scores(around.views, left_px)
+        own = sum_by_track(score[: len(track)] @ transform[image], track, points.size)
+        slab = transform[around.images].transpose(0, 2, 1) @ around.gather(score[:, None, :], own[:, None, :])
+        slab[0] *= 0.5
         blocks.add(layout.columns[image], layout.columns[around.images], slab.transpose(0, 2, 1))
     return blocks.matrix()
 
@@ -140,7 +140,7 @@ def _point_inverse(observations: JointObservations, weight: FloatArray) -> Float
 
 
 class _Blocks:
-    """A sparse symmetric matrix, collected block by block; the column behind the last one is padding."""
+    """A sparse symmetric matrix A + A^T; A is collected block by block, the column behind the last one is padding."""
 
     def __init__(self, num_columns: int) -> None:
         self._num_columns = num_columns
@@ -159,7 +159,7 @@ class _Blocks:
         self._columns.append(column[real].astype(np.int32))
         self._values.append(blocks[real])
         self._pending += self._values[-1].size
-        if self._pending > 4_000_000:
+        if self._pending > 1_000_000:
             self._flush()
 
     def _flush(self) -> None:
@@ -172,7 +172,7 @@ class _Blocks:
         self._rows, self._columns, self._values, self._pending = [], [], [], 0
 
     def matrix(self) -> sparse.csr_array:
-        """The sum of all blocks."""
+        """The sum of all blocks and of their transposes."""
         self._flush()
         shape = (self._num_columns, self._num_columns)
-        return sparse.csr_array(shape) if self._sum is None else self._sum
+        return sparse.csr_array(shape) if self._sum is None else sparse.csr_array(self._sum + self._sum.T)

@@ -7,13 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.inliers.projected import ImageInliers, ProjectedImage, image_inliers
+from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 MIN_INLIERS: Final = 20
+_POINT: Final = slice(3, 6)  # columns of J in the design
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
 _SINGULAR_POINT: Final = 1e-9  # determinant of V with unit diagonal
 _MIN_VIEWS: Final = 2
@@ -26,8 +27,10 @@ class JointObservations:
     model, residuals: where they come from.
     offsets: (I + 1,) image i owns rows offsets[i]:offsets[i + 1].    source: (n,) columns of ModelResiduals.
     image_idx: (n,).    point_idx: (n,) rows of PointTable; of an independent point, the observation itself.
-    crossed: (n, 3, C) w J^T N, what (6) sums to W^T; N itself is cheap to make again, see `nuisance`.
-    weight: (n,) w / s^2 with w = min(1, 2.5 s / |eps|); plain_weight: (n,) 1 / s^2.    1 / px^2.
+    design: (n, 2, C) rotation columns of N, J in place of translation columns, own columns; zero in padding.
+    transform: (I, C, C) T of each image: N = design T. A translation in the camera's axes moves a pixel as one in the
+    world's axes moves it, turned, so that nothing is stored twice.
+    weight: (n,) w / s^2 with w = min(1, 2.5 s / |eps|), 1 / px^2.
     sigma_px: (I,) s.    rms_px: (I,) of all inliers.
     by_point: (n,) rows by point, then in order; point_offsets: (P + 1,) point p owns by_point[o[p]:o[p + 1]].
     points_independent: whether points are known from elsewhere, so that nothing is eliminated.
@@ -40,9 +43,9 @@ class JointObservations:
     source: IntArray
     image_idx: IntArray
     point_idx: IntArray
-    crossed: FloatArray
+    design: FloatArray
+    transform: FloatArray
     weight: FloatArray
-    plain_weight: FloatArray
     sigma_px: FloatArray
     rms_px: FloatArray
     by_point: IntArray
@@ -73,27 +76,30 @@ class JointObservations:
 
     def jacobian(self, image_idx: int) -> FloatArray:
         """J (n_i, 2, 3) of an image, px per model unit, world frame."""
-        source = self.source[self.rows(image_idx)]
-        return np.ascontiguousarray(self.residuals.point_jacobian.take(source, axis=2).transpose(2, 0, 1))
+        return self.design[self.rows(image_idx), :, _POINT]
+
+    def nuisance(self, image_idx: int) -> FloatArray:
+        """N (n_i, 2, C) of an image, px per unit of its columns."""
+        return np.asarray(self.design[self.rows(image_idx)] @ self.transform[image_idx])
+
+    def weighted(self, views: IntArray | slice) -> tuple[FloatArray, FloatArray]:
+        """Return (v, 2, C) the design of some observations, and (v,) their weights."""
+        return self.design[views], self.weight[views]
+
+    def scores(self, views: IntArray | slice, left_px: FloatArray) -> FloatArray:
+        """(v, C) w design^T y~ of some observations; ``left_px`` (n, 2) is y~ of all."""
+        design, weight = self.weighted(views)
+        return design_scores(design, weight, left_px[views])
+
+    @property
+    def plain_weight(self) -> FloatArray:
+        """(n,) 1 / s^2, 1 / px^2."""
+        return np.repeat(self.sigma_px, np.diff(self.offsets)) ** -2.0
 
     def inliers(self, image_idx: int) -> ImageInliers:
         """The observations of an image that are in the system."""
         chosen = self.source[self.rows(image_idx)] - self.residuals.offsets[image_idx]
         return image_inliers(self.model, self.residuals, image_idx, chosen)
-
-    def nuisance(self, image_idx: int, projected: ProjectedImage | None = None) -> FloatArray:
-        """N (n_i, 2, C) of an image, px per unit of its columns; zero in padding and where it is not finite."""
-        projected = self.inliers(image_idx).projected if projected is None else projected
-        out = np.zeros((self.num_of(image_idx), 2, self.layout.width))
-        out[:, :, :NUM_POSE] = projected.pose.transpose(2, 1, 0)
-        if self.layout.has_rigs:
-            out[:, :, :NUM_POSE] = out[:, :, :NUM_POSE] @ self.layout.image_from_frame[image_idx]
-        params = list(self.layout.own_param_idxs[int(self.layout.camera_idx[image_idx])])
-        if params:
-            out[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
-        else:  # at the poles of a panorama a column may not be finite: no effect there
-            out[~np.isfinite(out)] = 0.0
-        return out
 
 
 def joint_observations(
@@ -117,7 +123,7 @@ def joint_observations(
     used = (counts >= MIN_INLIERS) & known & (model.images.camera_idx >= 0)
     used &= ~left_out if left_out is not None else True
     used &= _finite_images(residuals)
-    weight, plain = _weights(residuals, np.where(used, sigma_px, np.nan), counts)
+    weight = _weights(residuals, np.where(used, sigma_px, np.nan), counts)
     in_use = np.repeat(used, counts)
     if not points_independent:
         in_use &= _regular_points(residuals, np.where(in_use, weight, 0.0), len(model.points))[residuals.point_idx]
@@ -137,15 +143,54 @@ def joint_observations(
         source,
         image_idx,
         point_idx,
-        np.zeros((source.size, 3, layout.width)),
+        _design(model, residuals, layout, source, offsets),
+        _transforms(model, layout),
         weight[source],
-        plain[source],
         sigma_px,
         _rms_px(residuals, counts),
         by_point,
         point_offsets,
         points_independent,
     )
+
+
+def _design(
+    model: SparseModel, residuals: ModelResiduals, layout: Layout, source: IntArray, offsets: IntArray
+) -> FloatArray:
+    """(n, 2, C), image by image."""
+    out = np.zeros((source.size, 2, layout.width))
+    for image in np.flatnonzero(np.diff(offsets)).tolist():
+        rows = slice(int(offsets[image]), int(offsets[image + 1]))
+        inliers = image_inliers(model, residuals, image, source[rows] - residuals.offsets[image])
+        projected, own = inliers.projected, out[rows]
+        own[:, :, : _POINT.start] = projected.pose[: _POINT.start].transpose(2, 1, 0)
+        own[:, :, _POINT] = residuals.point_jacobian.take(source[rows], axis=2).transpose(2, 0, 1)
+        params = list(layout.own_param_idxs[int(layout.camera_idx[image])])
+        if params:
+            own[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
+        else:  # at the poles of a panorama a column may not be finite: no effect there
+            own[~np.isfinite(own)] = 0.0
+    return out
+
+
+def _transforms(model: SparseModel, layout: Layout) -> FloatArray:
+    """(I, C, C) T: d / d translation of the camera = J R^-1, then from the frame's pose to the image's."""
+    out = np.tile(np.eye(layout.width), (len(model.images), 1, 1))
+    for image in np.flatnonzero(layout.has_columns).tolist():
+        out[image, _POINT, _POINT] = np.linalg.pinv(model.image(image).rotation_cam_from_world)
+    out[:, :NUM_POSE, :NUM_POSE] = out[:, :NUM_POSE, :NUM_POSE] @ layout.image_from_frame
+    return out
+
+
+def design_crossed(design: FloatArray, weight: FloatArray) -> FloatArray:
+    """(v, 3, C) w J^T design of observations: times T what (6) sums to W^T."""
+    weighted = design[:, :, _POINT] * weight[:, None, None]
+    return np.asarray(np.matmul(weighted.transpose(0, 2, 1), design))
+
+
+def design_scores(design: FloatArray, weight: FloatArray, left_px: FloatArray) -> FloatArray:
+    """(v, C) w design^T y~ of observations with the residuals y~ (v, 2)."""
+    return np.asarray(np.einsum("nac,na->nc", design, left_px * weight[:, None]))
 
 
 def _finite_images(residuals: ModelResiduals) -> BoolArray:
@@ -155,15 +200,14 @@ def _finite_images(residuals: ModelResiduals) -> BoolArray:
     return np.asarray(sums[residuals.offsets[1:]] == sums[residuals.offsets[:-1]])
 
 
-def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return w / s^2 and 1 / s^2 of all inliers; NaN without noise."""
+def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) -> FloatArray:
+    """Return w / s^2 of all inliers; NaN without noise."""
     sigma = np.repeat(sigma_px, counts)
     length = np.sqrt((residuals.residuals_px**2).sum(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         robust = np.minimum(1.0, _HUBER * sigma / length)
     robust[length == 0] = 1.0
-    plain = 1.0 / sigma**2
-    return robust * plain, plain
+    return np.asarray(robust / sigma**2)
 
 
 def _rms_px(residuals: ModelResiduals, counts: IntArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -70,8 +71,14 @@ class Gains:
     both: float
 
 
-def own_parameters(system: JointSystem) -> tuple[CameraStep, ...]:
+def own_parameters(
+    system: JointSystem, image_covariances: Mapping[int, FloatArray] | None = None
+) -> tuple[CameraStep, ...]:
     """Return the steps of all cameras that have images in the system.
+
+    Parameters
+    ----------
+    image_covariances : `JointSystem.image_covariances` of images, by image, where they are at hand
 
     Notes
     -----
@@ -80,8 +87,15 @@ def own_parameters(system: JointSystem) -> tuple[CameraStep, ...]:
     """
     layout = system.observations.layout
     cameras = np.unique(layout.camera_idx[layout.has_columns]).tolist()
-    covariances = system.covariances([layout.own_of_camera(camera) for camera in cameras])
-    return tuple(_camera_step(system, camera, own) for camera, own in zip(cameras, covariances, strict=True))
+    known = {} if image_covariances is None else image_covariances
+    covariances: dict[int, FloatArray] = {}
+    for image, covariance in known.items():
+        if layout.has_columns[image]:
+            covariances[int(layout.camera_idx[image])] = covariance[NUM_POSE:, NUM_POSE:]
+    missing = [camera for camera in cameras if camera not in covariances]
+    found = system.covariances([layout.own_of_camera(camera) for camera in missing])
+    covariances.update(zip(missing, found, strict=True))
+    return tuple(_camera_step(system, camera, covariances[camera]) for camera in cameras)
 
 
 def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -> CameraStep:
@@ -162,7 +176,7 @@ def _implied_focal(stored: float, step: float, relief: float) -> float:
 
 def wald(system: JointSystem, columns: IntArray, step: FloatArray) -> float:
     """Return step^T [(S^+)_bb]^-1 step at some columns b; unidentified directions gain nothing."""
-    block = system.base.inverse.main[np.ix_(columns, columns)]
+    block = system.base.inverse.main.block(columns)
     diagonal = block.diagonal()
     used = (diagonal > 0) & ~system.base.inverse.unidentified[columns]
     if not used.any():

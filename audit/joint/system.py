@@ -42,7 +42,6 @@ class Base:
     """What candidates are tested against: everything that was or could be fitted.
 
     inverse: S^+.    step: (D + m,) S^+ g.    point_step: (P, 3).    left_px: (n, 2) y~.
-    view_scores: (n, C) h = w N^T y~.
     included: by image.
     """
 
@@ -52,7 +51,6 @@ class Base:
     step: FloatArray
     point_step: FloatArray
     left_px: FloatArray
-    view_scores: FloatArray
     included: dict[int, IncludedFields]
 
 
@@ -123,7 +121,7 @@ class JointSystem:
         inverse, out = self.base.inverse, []
         for batch in _batches(blocks):
             columns = np.concatenate(batch)
-            rows = inverse.main[columns]
+            rows = inverse.main.rows(columns)
             spread = (self.meat @ np.ascontiguousarray(rows.T)).T
             start = 0
             for block in batch:
@@ -180,14 +178,12 @@ def joint_system(
     gauge = gauge_directions(model, observations)
     reduced, plain = reduced_systems(observations)
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
-    step = inverse.main @ reduced.right
-    nothing = np.zeros((0, observations.layout.width))
-    base = with_step(
-        Base(observations, reduced.point_inverse, inverse, step, nothing[:, :3], nothing[:, :2], nothing, {}), step
-    )
+    step = inverse.main.apply(reduced.right)
+    nothing = np.zeros((0, 3))
+    base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
     plain_step = _plain_step(plain, base, gauge)
     del plain
-    return JointSystem(model, residuals, base, reduced, score_meat(observations, base.view_scores), plain_step)
+    return JointSystem(model, residuals, base, reduced, score_meat(observations, base.left_px), plain_step)
 
 
 def with_step(base: Base, step: FloatArray) -> Base:
@@ -202,18 +198,13 @@ def with_step(base: Base, step: FloatArray) -> Base:
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
     moved = point_steps(observations, weight, base.point_inverse, left)
     left = off_points(observations, weight, base.point_inverse, left)
-    scores = np.empty((len(left), layout.width))
-    for image in observations.used_images:
-        rows = observations.rows(image)
-        pulled = left[rows] * weight[rows, None]
-        scores[rows] = np.einsum("nac,na->nc", observations.nuisance(image), pulled)
-    return replace(base, step=step, point_step=moved, left_px=left, view_scores=scores)
+    return replace(base, step=step, point_step=moved, left_px=left)
 
 
 def _plain_step(plain: ReducedSystem, base: Base, gauge: FloatArray) -> FloatArray:
     """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
     if len(plain.right) <= _DIRECT:
-        return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main @ plain.right)
-    front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=lambda x: base.inverse.main @ x)
+        return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main.apply(plain.right))
+    front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=base.inverse.main.apply)
     step, _ = sparse_linalg.cg(plain.matrix, plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
     return np.asarray(step)

@@ -27,15 +27,17 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xyz_world=raw.points.xyz_world[order],
         stored_error_px=raw.points.stored_error_px[order],
     )
-    poses, rig_findings = compose_poses(raw)
+    placed, rig_findings = compose_poses(raw)
     images = ImageTable(
         image_id=raw.images.image_id,
         name=raw.images.name,
         camera_id=raw.images.camera_id,
         camera_idx=rows_of(raw.cameras.camera_id.astype(np.uint64), raw.images.camera_id.astype(np.uint64)),
-        quat_cam_from_world_wxyz=poses[:, :4].copy(),
-        translation_cam_from_world=poses[:, 4:].copy(),
+        quat_cam_from_world_wxyz=placed.poses[:, :4].copy(),
+        translation_cam_from_world=placed.poses[:, 4:].copy(),
         num_points2d=raw.images.num_points2d,
+        frame_idx=placed.frame_idx,
+        pose_cam_from_rig=placed.pose_cam_from_rig,
     )
     observations = ObservationTable(
         offsets=raw.images.offsets,
@@ -43,7 +45,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         xy_px=raw.images.xy_px,
         point_idx=rows_of(points.point3d_id, raw.images.point3d_id),
     )
-    known = raw.findings + rig_findings + unused_nonfinite(raw, poses)
+    known = raw.findings + rig_findings + unused_nonfinite(raw, placed.poses)
     model = SparseModel(location, file_format, raw.cameras, images, points, observations, known)
     return SparseModel(
         location,

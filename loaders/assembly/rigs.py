@@ -7,16 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, Pose, RawFrame, RawImages, RawModel, RawRig
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, IDENTITY_POSE, Pose, RawFrame, RawImages, RawModel, RawRig
 from sfm_audit.loaders.model import Finding, FindingCode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FramePoses:
-    """Per image: sensor_from_rig and rig_from_world, and why an image has none."""
+    """Per image: sensor_from_rig and rig_from_world and the frame they are of, and why an image has none."""
 
     rows: list[int]
+    frame_ids: list[int]
     sensor_from_rig: list[Pose]
     rig_from_world: list[Pose]
     problems: dict[int, str]
@@ -36,24 +37,44 @@ def compose(cam_from_rig: FloatArray, rig_from_world: FloatArray) -> FloatArray:
     return np.hstack([w, q, b_t + a_w * twice + np.cross(a_q, twice) + a_t])
 
 
-def compose_poses(raw: RawModel) -> tuple[FloatArray, tuple[Finding, ...]]:
-    """Return (I, 7) cam_from_world of all images.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedImages:
+    """cam_from_world (I, 7) of all images; frame_idx and pose_cam_from_rig as in `ImageTable`."""
+
+    poses: FloatArray
+    frame_idx: IntArray | None = None
+    pose_cam_from_rig: FloatArray | None = None
+
+
+def compose_poses(raw: RawModel) -> tuple[PlacedImages, tuple[Finding, ...]]:
+    """Return the poses of all images.
 
     With rigs and frames the poses of the images file are ignored, as in COLMAP. An image that they do not place
     keeps the pose of the images file, and a finding says so.
     """
     images, rigs, frames = raw.images, raw.rigs, raw.frames
     if rigs is None or frames is None:
-        return images.poses, _one_file_missing(rigs, frames)
+        return PlacedImages(images.poses), _one_file_missing(rigs, frames)
     if not rigs and not frames:
-        return images.poses, ()
+        return PlacedImages(images.poses), ()
     parts = _frame_poses(images, rigs, frames)
     poses = images.poses.copy()
     if parts.rows:
         with np.errstate(invalid="ignore", over="ignore"):  # a non-finite pose is a finding, not an error
             poses[parts.rows] = compose(np.array(parts.sensor_from_rig), np.array(parts.rig_from_world))
     findings = _not_placed(images, parts.problems), _not_there(images, frames), _sensors_disagree(raw, rigs, frames)
-    return poses, tuple(finding for some in findings for finding in some)
+    return _placed(poses, parts), tuple(finding for some in findings for finding in some)
+
+
+def _placed(poses: FloatArray, parts: _FramePoses) -> PlacedImages:
+    """Say which images go together, where any two do."""
+    if len(set(parts.frame_ids)) == len(parts.frame_ids):
+        return PlacedImages(poses)
+    key = np.arange(len(poses), dtype=np.int64)  # of an image that is not placed, nobody else's
+    key[parts.rows] = len(poses) + np.unique(parts.frame_ids, return_inverse=True)[1]
+    cam_from_rig = np.tile(np.array(IDENTITY_POSE), (len(poses), 1))
+    cam_from_rig[parts.rows] = parts.sensor_from_rig
+    return PlacedImages(poses, np.unique(key, return_inverse=True)[1].astype(np.int64), cam_from_rig)
 
 
 def _frame_poses(images: RawImages, rigs: Sequence[RawRig], frames: Sequence[RawFrame]) -> _FramePoses:
@@ -62,7 +83,7 @@ def _frame_poses(images: RawImages, rigs: Sequence[RawRig], frames: Sequence[Raw
     for frame in frames:
         for image_id in frame.image_ids:
             frames_of.setdefault(image_id, []).append(frame)
-    parts = _FramePoses([], [], [], {})
+    parts = _FramePoses([], [], [], [], {})
     ids = zip(images.image_id.tolist(), images.camera_id.tolist(), strict=True)
     for row, (image_id, camera_id) in enumerate(ids):
         owners = frames_of.get(image_id, [])
@@ -80,6 +101,7 @@ def _frame_poses(images: RawImages, rigs: Sequence[RawRig], frames: Sequence[Raw
                 parts.problems[row] = f"has camera {camera_id}, which has no pose in rig {rig.rig_id}"
             else:
                 parts.rows.append(row)
+                parts.frame_ids.append(owners[0].frame_id)
                 parts.sensor_from_rig.append(sensor_from_rig)
                 parts.rig_from_world.append(owners[0].rig_from_world)
     return parts

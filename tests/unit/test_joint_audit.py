@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from joint_reference import SPEC, model_of, with_param
+from joint_reference import SPEC, model_of, system_of, with_param
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.joint import CameraStep, audit_jointly, covisible_blocks
+from sfm_audit.audit.joint import CameraStep, audit_jointly, covisible_blocks, implied_parameters, own_parameters
 from sfm_audit.audit.joint.own import _implied_focal
 from sfm_audit.audit.table.words import MisfitStatus
 
@@ -131,3 +131,19 @@ def test_a_model_without_usable_images_says_nothing(chain):
     assert np.isnan(found.misfit.effect_px).all()
     assert not found.misfit.most_are_wrong
     assert all(np.isnan(gains.both) for gains in found.gains)
+
+
+@pytest.mark.parametrize("excluded", [(), (3,)])
+def test_implied_parameters_are_the_same_whether_asked_for_alone_or_beside_the_misfit(chain, excluded):
+    """A camera whose only image is not tested is asked for on its own."""
+    found = audited(chain, excluded=np.isin(np.arange(30), excluded)).implied
+    system = system_of(chain)
+    alone = implied_parameters(system, own_parameters(system))
+    assert [(one.parameter, one.camera_idx, one.found) for one in found] == [
+        (one.parameter, one.camera_idx, one.found) for one in alone
+    ]
+    for one, other in zip(found, alone, strict=True):
+        assert one.image_idxs.tolist() == other.image_idxs.tolist()
+        assert_allclose(one.step, other.step, rtol=1e-6)
+        assert_allclose(one.sd, other.sd, rtol=1e-6)
+        assert one.px == pytest.approx(other.px, rel=1e-6)

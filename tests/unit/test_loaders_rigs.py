@@ -95,3 +95,21 @@ def test_a_frame_pose_that_is_not_finite_is_a_finding(tmp_path: Path):
     frames = (replace(SOURCE.frames[0], pose=(float("inf"), *FRONT[1:])), SOURCE.frames[1])
     model = open_model(write_binary(tmp_path, SOURCE.but(frames=frames)))
     assert [(f.code, f.count) for f in model.findings] == [(FindingCode.NON_FINITE_POSES, 2)]
+
+
+@WRITERS
+def test_images_of_one_frame_are_told_with_where_their_sensors_are(tmp_path: Path, write):
+    images = open_model(write(tmp_path, SOURCE)).images
+    assert images.image_id.tolist() == [3, 4, 90]
+    assert images.frame_idx is not None
+    assert images.frame_idx[0] == images.frame_idx[1] != images.frame_idx[2]
+    identity = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert_array_equal(images.pose_cam_from_rig, [identity, SOURCE.rigs[0].sensors[1][2], identity])
+
+
+@WRITERS
+@pytest.mark.parametrize("changes", [{"rigs": None}, {"frames": ()}, {"rigs": (Rig(2, ((0, 1, None),)),)}])
+def test_where_no_two_images_are_placed_together_there_are_no_frames(tmp_path: Path, write, changes):
+    images = open_model(write(tmp_path, SOURCE.but(**changes))).images
+    assert images.frame_idx is None
+    assert images.pose_cam_from_rig is None

@@ -28,7 +28,7 @@ def jacobian_of(xyz_cam):
 
 def test_columns_are_the_derivatives_by_rotation_and_translation():
     xyz = points(np.random.default_rng(0))
-    columns = pose_columns(jacobian_of(xyz), xyz.T)
+    columns = pose_columns(jacobian_of(xyz), xyz)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 1e-6
@@ -43,18 +43,18 @@ def test_offset_is_what_least_squares_removes(seed):
     rng = np.random.default_rng(seed)
     xyz = points(rng)
     residuals = rng.normal(size=(2, len(xyz)))
-    columns = pose_columns(jacobian_of(xyz), xyz.T).reshape(6, -1).T
+    columns = pose_columns(jacobian_of(xyz), xyz).reshape(6, -1).T
     removed = columns @ np.linalg.lstsq(columns, residuals.reshape(-1), rcond=None)[0]
     expected = math.sqrt(removed @ removed / len(xyz))
-    assert pose_offset_px(residuals, jacobian_of(xyz), xyz.T) == pytest.approx(expected, rel=1e-9)
+    assert pose_offset_px(residuals, jacobian_of(xyz), xyz) == pytest.approx(expected, rel=1e-9)
 
 
 def test_degenerate_points_take_the_singular_value_path():
     xyz = np.tile([[0.3, 0.2, 5.0]], (30, 1))  # one point: the pose has two effects, not six
     residuals = np.random.default_rng(1).normal(size=(2, 30))
     expected = math.sqrt(30 * (residuals.mean(axis=1) ** 2).sum() / 30)
-    assert pose_offset_px(residuals, jacobian_of(xyz), xyz.T) == pytest.approx(expected, rel=1e-6)
-    assert math.isnan(pose_offset_px(np.empty((2, 0)), np.empty((2, 3, 0)), np.empty((3, 0))))
+    assert pose_offset_px(residuals, jacobian_of(xyz), xyz) == pytest.approx(expected, rel=1e-6)
+    assert math.isnan(pose_offset_px(np.empty((2, 0)), np.empty((2, 3, 0)), np.empty((0, 3))))
 
 
 def test_a_pose_moved_after_adjustment_is_found_and_others_are_at_rest():

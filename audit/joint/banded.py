@@ -1,0 +1,215 @@
+"""S^+ where images see points of their neighbours only: block Cholesky and the selected inverse (method.md section 11).
+
+A video, a street or a strip of aerial photos has columns that couple within a band of width m, so that S is block
+tridiagonal in some order. Its factor costs D m^2 instead of D^3, and D m numbers instead of D^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import blas, lapack, qr
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+
+_REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
+_MIN_BLOCKS: Final = 4  # fewer are no band
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """How the columns of a sparse symmetric matrix are ordered into blocks that couple with the next one only.
+
+    order: (D,) column at each place.    place: (D,) of each column.    width: of a block; the last one may be smaller.
+    """
+
+    order: IntArray
+    place: IntArray
+    width: int
+
+    def blocks(self) -> Iterator[slice]:
+        """Places of each block."""
+        for start in range(0, len(self.order), self.width):
+            yield slice(start, min(start + self.width, len(self.order)))
+
+
+def band_of(matrix: sparse.csr_array) -> Band | None:
+    """Order the columns (reverse Cuthill-McKee); None where there is no band worth it."""
+    size = matrix.shape[0]
+    order = reverse_cuthill_mckee(matrix, symmetric_mode=True).astype(np.int64)
+    place = np.empty(size, dtype=np.int64)
+    place[order] = np.arange(size)
+    row = np.repeat(place.astype(np.int32), np.diff(matrix.indptr))
+    width = int(np.abs(row - place.astype(np.int32)[matrix.indices]).max(initial=0))
+    return Band(order, place, max(width, 1)) if size >= _MIN_BLOCKS * max(width, 1) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BandedFactor:
+    """X = (S + F F^T)^-1, with F one unit vector for each null direction of S, in the order of a band.
+
+    diagonal: L_i of each block.    below: C_i = A_(i+1, i) L_i^-T.    null: (D, g) orthonormal G, all null directions.
+    S X S = S, and S^+ = P X P with P = 1 - G G^T. No shift: where there is no such factor, None is built.
+    """
+
+    band: Band
+    diagonal: list[FloatArray]
+    below: list[FloatArray]
+    null: FloatArray
+    shift: float = 0.0
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """P X P right, (D, c), rows as in the matrix."""
+        null, order = self.null, self.band.order
+        out = self.solve_in_order(right[order] - null @ (null.T @ right[order]))
+        out -= null @ (null.T @ out)
+        return out[self.band.place]
+
+    def solve_in_order(self, right: FloatArray) -> FloatArray:
+        """X right, (D, c), rows by place; nothing is computed above the first row that is not zero."""
+        out = np.array(right, order="C")
+        blocks = list(self.band.blocks())
+        first = int(np.argmax(out.any(axis=1))) // self.band.width
+        for i in range(first, len(blocks)):
+            if i > first:
+                out[blocks[i]] -= self.below[i - 1] @ out[blocks[i - 1]]
+            out[blocks[i]] = _triangular(self.diagonal[i], out[blocks[i]], transposed=False)
+        for i in range(len(blocks) - 1, -1, -1):
+            if i + 1 < len(blocks):
+                out[blocks[i]] -= self.below[i].T @ out[blocks[i + 1]]
+            out[blocks[i]] = _triangular(self.diagonal[i], out[blocks[i]], transposed=True)
+        return out
+
+
+def _triangular(lower: FloatArray, right: FloatArray, *, transposed: bool) -> FloatArray:
+    """L^-1 right, or L^-T right; as right^T L^-T or right^T L^-1, so that rows in C order need no copy for BLAS."""
+    return np.asarray(blas.dtrsm(1.0, lower, right.T, side=1, lower=1, trans_a=int(not transposed))).T
+
+
+def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> BandedFactor | None:
+    """Factor S (D, D), unit diagonal; None where S + F F^T is not positive definite.
+
+    Parameters
+    ----------
+    null : (D, g) orthonormal, directions that S leaves free
+
+    Notes
+    -----
+    F: the g rows at which the null directions differ most (pivoted QR of G^T); one for each, or X were no inverse of S.
+    """
+    ordered = matrix[band.order][:, band.order]
+    free = null[band.order]
+    pinned = np.sort(qr(free.T, mode="r", pivoting=True)[1][: free.shape[1]]) if free.shape[1] else np.empty(0, int)
+    diagonal: list[FloatArray] = []
+    below: list[FloatArray] = []
+    blocks = list(band.blocks())
+    for i, own in enumerate(blocks):
+        block = ordered[own, own].toarray()
+        here = pinned[(pinned >= own.start) & (pinned < own.stop)] - own.start
+        block[here, here] += 1.0
+        if i:
+            block -= below[-1] @ below[-1].T
+        lower, info = lapack.dpotrf(block, lower=1, clean=1)
+        if info:
+            return None
+        diagonal.append(lower)
+        if i + 1 < len(blocks):
+            coupled = ordered[blocks[i + 1], own].toarray()
+            below.append(np.ascontiguousarray(_triangular(lower, coupled.T, transposed=False).T))
+    return BandedFactor(band, diagonal, below, free)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BandedInverse:
+    """S^+ = D^-1 P X P D^-1, of which the blocks near the diagonal are at hand.
+
+    near: per block i, the entries of X at its rows and at the columns of the blocks i .. i + 3.
+    pull: (D, g) H = X G - G (G^T X G) / 2, so that P X P = X - G H^T - H G^T; by place.
+    inverse_scale: (D,) 1 / D, zero for dead columns; as in the matrix.
+    """
+
+    factor: BandedFactor
+    near: list[FloatArray]
+    pull: FloatArray
+    inverse_scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.inverse_scale)
+
+    def apply(self, right: FloatArray) -> FloatArray:
+        """S^+ right, of (D,) or (D, c)."""
+        columns = right.reshape(len(right), -1) * self.inverse_scale[:, None]
+        return (self.factor.solve(columns) * self.inverse_scale[:, None]).reshape(right.shape)
+
+    def times(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """S^+ (all rows, at some columns) @ right: (D, c) of (k, c)."""
+        padded = np.zeros((len(self), right.shape[1]))
+        padded[columns] = right
+        return self.apply(padded)
+
+    def rows(self, columns: IntArray) -> FloatArray:
+        """(k, D) rows of S^+."""
+        return self.times(columns, np.eye(columns.size)).T
+
+    def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
+        """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
+        if self._is_near(columns):
+            return np.asarray(self.block(columns) @ right)
+        return self.times(columns, right)[columns]
+
+    def _is_near(self, columns: IntArray) -> bool:
+        """Whether all entries at some columns are at hand."""
+        number = self.factor.band.place[columns] // self.factor.band.width
+        return not number.size or int(number.max() - number.min()) <= _REACH
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """(k, k) entries of S^+ at some columns."""
+        if not self._is_near(columns):
+            return self.rows(columns)[:, columns]
+        place = self.factor.band.place[columns]
+        by_place = np.argsort(place, kind="stable")
+        place = place[by_place]
+        number = place // self.factor.band.width
+        out = np.empty((place.size, place.size))
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [place.size]]).tolist()
+        for start, stop in pairwise(bounds) if place.size else ():
+            origin = number[start] * self.factor.band.width
+            part = self.near[number[start]][np.ix_(place[start:stop] - origin, place[start:] - origin)]
+            out[start:stop, start:] = part
+            out[stop:, start:stop] = part[:, stop - start :].T
+        outer = self.factor.null[place] @ self.pull[place].T
+        out -= outer + outer.T
+        back = np.argsort(by_place, kind="stable")
+        scale = self.inverse_scale[columns]
+        return out[np.ix_(back, back)] * scale * scale[:, None]
+
+
+def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInverse:
+    """Return S^+ in the units of the matrix.
+
+    Notes
+    -----
+    From the last block to the first, with U_i = C_i L_i^-1: X_(i, j) = -U_i^T X_(i+1, j) for j > i, and
+    X_(i, i) = (L_i L_i^T)^-1 - X_(i, i+1) U_i.
+    """
+    near: list[FloatArray] = []
+    width = factor.band.width
+    for i in range(len(factor.diagonal) - 1, -1, -1):
+        own, _ = lapack.dpotri(factor.diagonal[i], lower=1)
+        own = np.tril(own) + np.tril(own, -1).T
+        if not near:
+            near.append(own)
+            continue
+        u = _triangular(factor.diagonal[i], factor.below[i].T, transposed=True).T
+        beside = -u.T @ near[-1][:, : _REACH * width]
+        own -= beside[:, : len(u)] @ u
+        near.append(np.hstack([0.5 * (own + own.T), beside]))
+    null = factor.null
+    pulled = factor.solve_in_order(null)
+    return BandedInverse(factor, near[::-1], pulled - 0.5 * null @ (null.T @ pulled), inverse_scale)

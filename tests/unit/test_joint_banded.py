@@ -1,0 +1,107 @@
+"""Block Cholesky and selected inverse against the dense way and numpy's pseudo-inverse."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from joint_reference import SPEC, model_of, system_of
+from numpy.testing import assert_allclose
+
+from sfm_audit.audit.joint import inverse as joint_inverses
+from sfm_audit.audit.joint.banded import BandedInverse, band_of
+from sfm_audit.audit.joint.gauge import gauge_directions
+from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
+
+STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A model whose images see what their neighbours see, and nothing else."""
+    return system_of(model_of(STREET, seed=4))
+
+
+@pytest.fixture(scope="module")
+def scale(street):
+    return np.sqrt(street.reduced.matrix.diagonal())
+
+
+def inverted(system, *, dead=(), matrix=None):
+    matrix = system.reduced.matrix if matrix is None else matrix
+    before = system.reduced.before.copy()
+    before[list(dead)] *= 1e20
+    return joint_inverse(matrix, before, gauge_directions(system.model, system.observations))
+
+
+@pytest.fixture
+def dense(street, monkeypatch):
+    monkeypatch.setattr(joint_inverses, "band_of", lambda _: None)
+    return inverted(street)
+
+
+def test_a_street_is_a_band_and_a_room_is_none(street):
+    band = band_of(street.reduced.matrix)
+    row, column = street.reduced.matrix.nonzero()
+    assert band is not None
+    assert np.abs(band.place[row] - band.place[column]).max() == band.width
+    assert (band.order[band.place] == np.arange(len(band.order))).all()
+    room = system_of(model_of(dataclasses.replace(SPEC, num_images=12), seed=1))
+    assert band_of(room.reduced.matrix) is None
+    assert isinstance(street.base.inverse.main, BandedInverse)
+    assert isinstance(room.base.inverse.main, DenseInverse)
+
+
+def test_it_is_the_pseudo_inverse(street, scale):
+    """In units of unit diagonal, by numpy's eigendecomposition; whatever is asked for."""
+    unit = street.reduced.matrix.toarray() / scale / scale[:, None]
+    expected = np.linalg.pinv(unit, rcond=1e-11, hermitian=True)
+    main, size = street.base.inverse.main, len(scale)
+    tolerance = {"atol": 1e-8 * np.abs(expected).max()}
+    rng = np.random.default_rng(0)
+    near = street.observations.layout.columns[20:24].ravel()
+    for columns in (np.arange(size), near, rng.permutation(near), np.array([0, size - 1, 7]), near[:0]):
+        both = scale[columns] * scale[columns][:, None]
+        assert_allclose(main.block(columns) * both, expected[np.ix_(columns, columns)], **tolerance)
+        both_sides = main.within(columns, np.eye(len(columns)) * scale[columns]) * scale[columns][:, None]
+        assert_allclose(both_sides, expected[np.ix_(columns, columns)], **tolerance)
+        rows = main.rows(columns) * scale * scale[columns][:, None]
+        assert_allclose(rows, expected[columns], **tolerance)
+    right = rng.normal(size=(size, 3))
+    assert_allclose(scale[:, None] * main.apply(right * scale[:, None]), expected @ right, atol=1e-6)
+    assert_allclose(scale * main.apply(right[:, 0] * scale), expected @ right[:, 0], atol=1e-6)
+
+
+def test_it_is_the_dense_inverse(street, scale, dense):
+    both = scale * scale[:, None]
+    everything = np.arange(len(scale))
+    expected = dense.main.block(everything) * both
+    found = street.base.inverse
+    assert_allclose(found.main.block(everything) * both, expected, atol=1e-9 * np.abs(expected).max())
+    assert found.num_null == dense.num_null == 0
+    assert (found.unidentified == dense.unidentified).all()
+
+
+def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
+    dead = int(street.observations.layout.own_of_camera(30)[1])
+    found = inverted(street, dead=[dead])
+    monkeypatch.setattr(joint_inverses, "band_of", lambda _: None)
+    expected = inverted(street, dead=[dead])
+    columns = street.observations.layout.columns[30]
+    assert isinstance(found.main, BandedInverse)
+    assert np.flatnonzero(found.unidentified).tolist() == [dead]
+    assert not found.main.rows(np.array([dead])).any()
+    assert_allclose(found.main.block(columns), expected.main.block(columns), rtol=1e-6, atol=1e-30)
+
+
+def test_a_further_null_direction_is_found_in_a_band_too(street):
+    """A parameter made a copy of another one of its camera: S of x_a + x_b alone."""
+    first, second = street.observations.layout.own_of_camera(30)
+    merge = np.eye(len(street.reduced.right))
+    merge[second] = merge[first]
+    matrix = type(street.reduced.matrix)(merge @ street.reduced.matrix.toarray() @ merge.T)
+    found = inverted(street, matrix=matrix)
+    assert isinstance(found.main, BandedInverse)
+    assert found.num_null == 1
+    assert {int(first), int(second)} <= set(np.flatnonzero(found.unidentified).tolist())
