@@ -114,8 +114,10 @@ def frozen_section(frame: pd.DataFrame) -> str:
         off = "–" if cameras.empty else f"{cameras['off_sd'].max():.1f}"
         right = f"{int(cameras['implied_right'].sum())} of {len(cameras)}" if len(cameras) else "–"
         rows.append((case, *counts, *steps, named or "–", off, right))
-    header = ("frozen", "guilty: camera", "others: camera", "misfit", "others: standard", "own_step_px, guilty")
-    header = (*header, "largest of others", "named", "worst, sd", "value right")
+    header = (
+        *("frozen", "guilty: camera", "others: camera", "misfit", "others: standard", "own_step_px, guilty"),
+        *("largest of others", "named", "worst, sd", "value right"),
+    )
     return "\n\n".join([words.FROZEN, table(header, rows)])
 
 

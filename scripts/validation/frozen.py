@@ -58,6 +58,7 @@ def _scene_of(case: Frozen, noise: NoiseKind, scene_idx: int, rng: np.random.Gen
         sign = float(rng.choice([-1.0, 1.0]))
         values = (sign * float(rng.uniform(0.0015, 0.0025)), -sign * float(rng.uniform(0.001, 0.002)))
         defects = tuple(DefectSpec(i, DefectKind.TANGENTIAL, values=values) for i in range(NUM_IMAGES))
+    k1_range = SceneSpec().k1_range if case in _OWN_CAMERAS else _K1_RANGES[scene_idx % 2]
     spec = SceneSpec(
         num_images=NUM_IMAGES,
         points_per_image=POINTS_PER_IMAGE,
@@ -65,7 +66,7 @@ def _scene_of(case: Frozen, noise: NoiseKind, scene_idx: int, rng: np.random.Gen
         shared_camera=case not in _OWN_CAMERAS,
         noise=noise_of(noise),
         defects=defects,
-        **({} if case in _OWN_CAMERAS else {"k1_range": _K1_RANGES[scene_idx % 2]}),
+        k1_range=k1_range,
     )
     return simulate_scene(spec, rng)
 

@@ -123,8 +123,7 @@ def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     frame["num_failed"] = num_failed
     frame["noise_nu0"] = tables.models["noise_nu0"][0].as_py()
     frame["shared_reason"] = [any(text.startswith("shared_camera") for text in texts) for texts in images["reasons"]]
-    for name, values in {**_joint_columns(auditor), **policy_columns(tables.images)}.items():
-        frame[name] = values
+    frame = frame.assign(**_joint_columns(auditor), **policy_columns(tables.images))
     frame["effect_alone_px"] = _effect_alone_px(auditor)
     stored = model.cameras.params[model.cameras.param_offsets[model.images.camera_idx]]
     frame["focal_error_px"] = stored - scene.claimed_params[:, 0]
