@@ -340,8 +340,8 @@ class TrackStandardiser:
             low, high = (log_f, high) if excess > 0 else (low, log_f)
             if previous is not None and previous[1] != excess:
                 step = -excess * (log_f - previous[0]) / (excess - previous[1])
-            else:
-                step = excess / slope
+            else:  # all clipped: no slope, and the factor is far too small
+                step = excess / slope if slope > 0 else math.copysign(math.inf, excess)
             previous = log_f, excess
             log_f = _inside(log_f, step, low, high)
         return StandardisedImage(z, math.exp(log_f), converged=False)

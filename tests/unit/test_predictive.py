@@ -174,3 +174,14 @@ def test_all_zero_residuals_have_no_factor():
     assert math.isnan(image.factor)
     assert not image.converged
     assert image.z.shape == (30, 2)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e9, 1e-9])
+def test_residuals_far_from_the_prediction_find_their_factor_without_a_warning(factor):
+    # all z are clipped at the first try, so that the slope is 0: a warning, which is an error here
+    e, other, dof = simulate(np.random.default_rng(11), 400, 8.0, 0.5)
+    prior = fit_track_prior((e**2).sum(axis=0), other, dof)
+    standardiser = TrackStandardiser.build(predict(prior, other, dof))
+    usual, far = (standardiser.standardise(scale * e, slice(0, 400)) for scale in (1.0, factor))
+    assert far.converged
+    assert_allclose(far.factor, factor * usual.factor, rtol=1e-6)
