@@ -53,6 +53,7 @@ class FindingCode(StrEnum):
     POINTS_BEHIND = "points_behind"
     IMAGES_DISAGREE = "images_disagree"
     PIXEL_CONVENTION = "pixel_convention"
+    ROUNDED_POSES = "rounded_poses"
     IMPLIED_PRINCIPAL_POINT = "implied_principal_point"
     IMPLIED_RADIAL = "implied_radial"
     IMPLIED_ASPECT = "implied_aspect"
@@ -95,6 +96,7 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.POINTS_BEHIND: "all observations lie behind their cameras: axes flipped, or poses inverted?",
     FindingCode.IMAGES_DISAGREE: "images whose camera, pose, points and 2D points do not belong together",
     FindingCode.PIXEL_CONVENTION: "all observations are shifted by half a pixel: another convention of pixel centres",
+    FindingCode.ROUNDED_POSES: "all poses are rounded to a few decimals: somebody printed them, and pixels were lost",
     FindingCode.IMPLIED_PRINCIPAL_POINT: "adjusting the principal point, which nobody freed, would move it by so much",
     FindingCode.IMPLIED_RADIAL: "the next radial coefficient, which the camera model lacks, would be so large",
     FindingCode.IMPLIED_ASPECT: "fx / fy, which the camera model takes as 1, would be so much",

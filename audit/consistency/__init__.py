@@ -42,6 +42,9 @@ poses_or_points             none of these
 A half pixel (`pixel_convention`): A = 1 and a shift of +-(0.5, 0.5) px within 5 sd in over half of the images, before
 the pose's step, which would hide it. It can be seen only where nobody adjusted the poses since.
 
+Rounded poses (`rounded_decimals`): all stored quaternions and translations have a few decimals only. Nothing is
+rejected for it; the pose's own step says what it cost.
+
 Blind spots: whatever was adjusted together after the fault. An affine map of a flat or distant scene is also what a
 turned or shifted camera does, and then the pose's step takes it. Panoramas have no affine map. Fewer than 20
 observations say nothing.
@@ -59,6 +62,7 @@ from sfm_audit.audit.consistency.model import (
     consistency_of,
     model_consistency,
 )
+from sfm_audit.audit.consistency.rounding import rounded_decimals
 
 __all__ = [
     "CAUSE_MEANINGS",
@@ -74,4 +78,5 @@ __all__ = [
     "fit_affine",
     "image_consistency",
     "model_consistency",
+    "rounded_decimals",
 ]

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.consistency import ModelConsistency
+from sfm_audit.audit.consistency import ModelConsistency, rounded_decimals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, stale_finding
 from sfm_audit.audit.joint import JointAudit
 from sfm_audit.audit.noise.standardise import ModelTracks
@@ -41,6 +41,18 @@ def residual_findings(stored: StoredErrors, tracks: ModelTracks, num_points: int
         text = f"the fit of the noise prior stopped at nu0 = {tracks.prior.nu0:.3g}, s0 = {tracks.prior.s0_px:.3g} px"
         found.append(Finding(FindingCode.NOISE_PRIOR_NOT_CONVERGED, 1, text))
     return [finding for finding in found if finding is not None]
+
+
+def pose_findings(model: SparseModel) -> list[Finding]:
+    """Return that the stored poses are rounded, and what that is worth in px."""
+    quaternions, translations = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
+    decimals = rounded_decimals(quaternions, translations)
+    if decimals is None:
+        return []
+    focals = [model.camera(i).params[k] for i in range(len(model.cameras)) for k in model.camera(i).model.focal_idxs]
+    turned = f": half a step turns projections by up to {np.median(focals) * 10.0**-decimals:.2g} px" if focals else ""
+    text = f"quaternions and translations of all {len(model.images)} images are rounded to {decimals} decimals{turned}"
+    return [Finding(FindingCode.ROUNDED_POSES, len(model.images), text)]
 
 
 def consistency_findings(consistency: ModelConsistency) -> list[Finding]:

@@ -15,8 +15,8 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
 from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
-from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras
-from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, residual_findings
+from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
+from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, pose_findings, residual_findings
 from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, camera_diagnostics
 from sfm_audit.audit.engine.jointly import (
     consistency_diagnostics,
@@ -332,11 +332,11 @@ class ModelAuditor:
         )
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
-        findings = [*self.model.findings, *own_findings]
+        findings = [*self.model.findings, *pose_findings(self.model), *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(
             images_table(rows),
-            table_of("cameras", [self._camera_row(camera, labels) for camera in self.cameras]),
+            table_of("cameras", [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]),
             table_of("models", [row]),
             self.observations(labels) if observations else None,
         )
