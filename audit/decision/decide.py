@@ -91,7 +91,7 @@ def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
             Member.MISFIT: judge_misfit(diagnostics, found, settings),
             **({} if camera is None else {Member.CAMERA: camera}),
             Member.POSE: judge_pose(diagnostics, settings),
-            Member.PLAUSIBLE: judge_plausible(diagnostics, settings),
+            Member.PLAUSIBLE: _without_k1_remark(judge_plausible(diagnostics, settings), camera),
             Member.NOISE: judge_noise(diagnostics, settings),
             Member.KS: judge_ks(diagnostics, settings),
         }
@@ -112,6 +112,14 @@ def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName, *, 
     for reason in (reason for each in deciding for reason in each.reasons):
         reasons.setdefault(str(reason), reason)
     return Judgement(strongest(each.verdict for each in deciding), tuple(reasons.values()))
+
+
+def _without_k1_remark(plausible: Judgement, camera: Judgement | None) -> Judgement:
+    """Leave out that k1 is small where the camera is rejected: a k1 frozen at 0 is wrong, not superfluous."""
+    if camera is None or camera.verdict is not Verdict.REJECTED:
+        return plausible
+    kept = tuple(reason for reason in plausible.reasons if reason.code is not ReasonCode.K1_NOT_IDENTIFIED)
+    return replace(plausible, reasons=kept)
 
 
 def _all_behind(diagnostics: Diagnostics) -> Reason | None:

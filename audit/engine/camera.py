@@ -172,6 +172,19 @@ def _distortion_identified(quality: Sequence[CameraQuality | None], min_sds: flo
     return False
 
 
+def settled(camera: CameraAudit, decisions: Sequence[Decision]) -> CameraAudit:
+    """Return the camera without the advice that less would do where half of its images or more are rejected.
+
+    Parameters
+    ----------
+    decisions : of all images of the model, in their order
+    """
+    said = [decisions[int(i)].under("camera").verdict for i in camera.image_idxs]
+    if camera.misfit.material or 2 * said.count(Verdict.REJECTED) < len(said):
+        return camera
+    return replace(camera, advised_camera_model=None)
+
+
 def image_advice(quality: CameraQuality, decision: Decision, retest: Retest, *, alpha: float) -> str | None:
     """Return the camera model that one image asks for; ``retest`` of its points and residuals.
 
