@@ -34,7 +34,7 @@ VERDICT_STYLE: Final[dict[str, str]] = {
 }
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "num_accepted", "num_rejected", "num_undetermined"),
-    *("stored_error_px", "recomputed_point_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
+    *("stored_error_px", "recomputed_observation_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
     "num_nonstationary_images",
     *(f"num_{verdict}_{member.short}" for member in Member for verdict in Verdict),
 )
@@ -176,7 +176,7 @@ def _models_part(models: _Models, page: Page) -> list[str]:
         Field("re-\njected", lambda r: str(r["num_rejected"]), lambda r: "red" if r["num_rejected"] else ""),
         Field("unde-\ntermined", lambda r: str(r["num_undetermined"])),
         Field("error px\nstored", lambda r: px(r["stored_error_px"]), _stale_style),
-        Field("error px\nrecomp.", lambda r: px(r["recomputed_point_error_px"])),
+        Field("error px\nobserv.", lambda r: px(r["recomputed_observation_error_px"])),
         Field("noise\npx", lambda r: px(r["noise_s0_px"])),
         Field("find-\nings", lambda r: str(len(r["findings"] or [])), lambda r: "yellow" if r["findings"] else ""),
     ]
