@@ -177,11 +177,20 @@ def test_all_zero_residuals_have_no_factor():
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e9, 1e-9])
-def test_residuals_far_from_the_prediction_find_their_factor_without_a_warning(factor):
-    # all z are clipped at the first try, so that the slope is 0: a warning, which is an error here
+def test_residuals_far_from_the_prediction_find_their_factor(factor):
     e, other, dof = simulate(np.random.default_rng(11), 400, 8.0, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
     standardiser = TrackStandardiser.build(predict(prior, other, dof))
     usual, far = (standardiser.standardise(scale * e, slice(0, 400)) for scale in (1.0, factor))
     assert far.converged
     assert_allclose(far.factor, factor * usual.factor, rtol=1e-6)
+
+
+def test_residuals_that_are_all_clipped_have_no_slope_and_cost_no_warning():
+    # a wrong pose moves all points one way: y given x is far out as well, so that nothing is left to give a slope
+    e, other, dof = simulate(np.random.default_rng(12), 60, 8.0, 0.5)
+    prior = fit_track_prior((e**2).sum(axis=0), other, dof)
+    moved = np.stack([np.full(60, 300.0), np.full(60, 900.0)]) + e
+    image = TrackStandardiser.build(predict(prior, other, dof)).standardise(moved, slice(0, 60))
+    assert image.factor > 100.0
+    assert np.isfinite(image.z).all()
