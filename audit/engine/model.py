@@ -42,7 +42,7 @@ from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.audit.table.words import MisfitStatus, ReasonCode
+from sfm_audit.audit.table.words import MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
 
@@ -326,11 +326,7 @@ class ModelAuditor:
         images = self._spread(partial(_images_of, labels=labels), self)
         rows = [row for row, _ in images]
         decisions = [decision for _, decision in images]
-        num_exact = sum(
-            any(reason.code == ReasonCode.EXACT_PROJECTIONS for reason in decision.all_reasons)
-            for decision in decisions
-        )
-        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), num_exact)
+        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
