@@ -37,6 +37,14 @@ class Rate:
         low, high = wilson(self.num, self.of)
         return f"{self.num} of {self.of} = {self.share:.1%} ({low:.1%} .. {high:.1%})"
 
+    @property
+    def brief(self) -> str:
+        """The same for a cell of a table."""
+        if not self.of:
+            return "-"
+        low, high = wilson(self.num, self.of)
+        return f"{self.num}/{self.of}, {100 * low:.0f}–{100 * high:.0f} %"
+
 
 def rate(mask: pd.Series) -> Rate:
     """Return how many of a mask are true."""
@@ -149,18 +157,21 @@ def auc(values: pd.Series, positive: pd.Series) -> float:
     return float((ranks[yes].sum() - num * (num + 1) / 2) / (num * others))
 
 
+FEWER_IS_WORSE: Final = ("num_inliers", "mean_track_length", "coverage")
 PREDICTORS: Final = (
-    *("mean_px", "num_inliers", "mean_track_length", "coverage"),
+    "mean_px",
+    *FEWER_IS_WORSE,
     *("sd_focal_rel_conditional", "sd_focal_rel_joint", "expected_error_px", "misfit_px", "own_step_px"),
 )
 
 
 def predictions(images: pd.DataFrame) -> dict[str, Sequence[float]]:
-    """Per column: Spearman's correlation with gt_px, all and median within models; the same with |f error|; AUCs.
+    """Per column: Spearman's correlation with gt_px, all and median within models; AUCs.
 
     AUC: wrong focal length (over 1 %, with and without kitti2), planted images (0.5 px and more) among their
-    neighbours.
+    neighbours. FEWER_IS_WORSE: of the negative number, so that a larger value always speaks against an image.
     """
+    images = images.assign(**{column: -images[column].astype(float) for column in FEWER_IS_WORSE})
     known = images[images.gt_px.notna()]
     focal = known.focal_rel.abs()
     elsewhere = known.bench_scene != "kitti2"

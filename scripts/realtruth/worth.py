@@ -11,7 +11,17 @@ import pandas as pd
 
 from scripts.realtruth.bench import healthy, neighbours, planted, rejected
 from scripts.realtruth.rates import VISIBLE_PX, Rate, rate
-from sfm_audit.audit.table.thresholds import ALPHA, MIN_EFFECT, WEAK_WORTH_DEG, WEAK_WORTH_FOCAL_REL, effect_px
+from sfm_audit.audit.decision.diagnostics import Worth
+from sfm_audit.audit.decision.misfit import is_worth_nothing
+from sfm_audit.audit.table.thresholds import (
+    ALPHA,
+    MIN_EFFECT,
+    MIN_SHIFT_WORTH_CENTRE,
+    MIN_SHIFT_WORTH_FOCAL_REL,
+    WEAK_WORTH_DEG,
+    WEAK_WORTH_FOCAL_REL,
+    effect_px,
+)
 from sfm_audit.audit.table.words import GROUPS, POLICIES, Member, MisfitGroup
 
 _OTHERS: Final = [member.value for member in POLICIES["standard"] if member not in {Member.MISFIT, Member.OUTSIDE}]
@@ -39,7 +49,7 @@ def above(tau_px: float) -> Callable[[pd.DataFrame], pd.Series]:
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
+class Least:
     """What a misfit must be worth: degrees, share of the median depth, share of f; one of them is enough.
 
     free: groups whose degrees do not count.
@@ -59,17 +69,38 @@ class Worth:
         return above(TAU_PX)(images) & enough
 
 
+def as_decided(images: pd.DataFrame) -> pd.Series:
+    """Return the rule of the audit (`is_worth_nothing`), on the columns of the table."""
+    worths = zip(
+        images.misfit_group,
+        images.misfit_worth_deg.astype(float),
+        images.misfit_worth_centre.astype(float),
+        images.misfit_worth_focal_rel.astype(float),
+        strict=True,
+    )
+    nothing = [
+        isinstance(group, str) and is_worth_nothing(MisfitGroup(group), Worth(*worth)) for group, *worth in worths
+    ]
+    return above(TAU_PX)(images) & ~pd.Series(nothing, index=images.index, dtype=bool)
+
+
 TAU_PX: Final = effect_px(MIN_EFFECT, None) or 0.2
 SHIFTS: Final = frozenset({MisfitGroup.PRINCIPAL_POINT, MisfitGroup.TANGENTIAL})
 """A turn of the image takes them up: 8 px of the principal point at f = 3000 px are 0.15 degrees, and the same rays."""
-_MEDIUM: Final = Worth(WEAK_WORTH_DEG, math.inf, WEAK_WORTH_FOCAL_REL)
-_USED: Final = Worth(0.05, 0.001, 0.003, SHIFTS)
+_DECIDED: Final = (
+    f"**{TAU_PX:g} px, {WEAK_WORTH_DEG:g} deg or {WEAK_WORTH_FOCAL_REL:.1%} of f; shifts: "
+    f"{MIN_SHIFT_WORTH_CENTRE:.1%} of depth or {MIN_SHIFT_WORTH_FOCAL_REL:.1%} of f**"
+)
 RULES: Final = (
-    *(Rule(f"effect > {tau_px:g} px", above(tau_px)) for tau_px in (TAU_PX, 0.3, 0.5)),
-    Rule(f"effect > {TAU_PX:g} px, {WEAK_WORTH_DEG:g} deg or {WEAK_WORTH_FOCAL_REL:.1%} of f", _MEDIUM.rejects),
+    *(Rule(f"{tau_px:g} px", above(tau_px)) for tau_px in (TAU_PX, 0.3, 0.5)),
     Rule(
-        f"effect > {TAU_PX:g} px, 0.05 deg (not of principal_point, tangential), 0.1% of the depth or 0.3% of f",
-        _USED.rejects,
+        f"{TAU_PX:g} px, {WEAK_WORTH_DEG:g} deg or {WEAK_WORTH_FOCAL_REL:.1%} of f",
+        Least(WEAK_WORTH_DEG, math.inf, WEAK_WORTH_FOCAL_REL).rejects,
+    ),
+    Rule(_DECIDED, as_decided),
+    Rule(
+        f"{TAU_PX:g} px, 0.05 deg (not of shifts), 0.1% of depth or 0.3% of f",
+        Least(0.05, 0.001, 0.003, SHIFTS).rejects,
     ),
 )
 

@@ -11,7 +11,7 @@ from scipy import stats
 from scripts import real_truth
 from scripts.realtruth.bounds import Bound
 from scripts.realtruth.rates import Rate, auc, spearman, wilson
-from scripts.realtruth.worth import SHIFTS, Worth
+from scripts.realtruth.worth import SHIFTS, Least, as_decided
 from sfm_audit.audit.table.words import GROUPS
 
 
@@ -83,7 +83,21 @@ def misfits(**changes):
     ],
 )
 def test_a_misfit_counts_when_it_is_there_and_worth_something(changes, rejected):
-    assert Worth(0.05, 0.001, 0.003, SHIFTS).rejects(misfits(**changes)).tolist() == [rejected]
+    assert Least(0.05, 0.001, 0.003, SHIFTS).rejects(misfits(**changes)).tolist() == [rejected]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rejected"),
+    [
+        ({"misfit_worth_deg": 0.0199}, False),
+        ({"misfit_worth_deg": 0.02}, True),
+        ({"misfit_worth_deg": 1.0, "misfit_group": "tangential"}, False),
+        ({"misfit_worth_deg": 1.0, "misfit_group": None}, False),
+        ({"misfit_worth_deg": np.nan}, True),
+    ],
+)
+def test_the_rule_of_the_audit_is_its_own(changes, rejected):
+    assert as_decided(misfits(**changes)).tolist() == [rejected]
 
 
 def test_without_models_the_script_says_so(tmp_path, capsys):
