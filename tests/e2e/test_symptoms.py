@@ -279,13 +279,13 @@ def test_the_head_does_not_hide_what_one_point_did_to_every_image(audited):
     assert max(float(number) for number in re.findall(r"\d+\.\d+", line)) > 100
 
 
-def test_a_list_warns_of_a_name_that_is_kept_and_removed(audited, tmp_path, capsys):
+def test_a_list_is_refused_where_a_name_is_kept_and_removed(audited, tmp_path, capsys):
     said = audited("c28_duplicate_names_in_list")
-    assert main(["filter", str(said.folder), "--list", str(tmp_path / "good.txt")]) == 0
-    err = capsys.readouterr().err
-    assert err.startswith("sfm-audit: warning: ")
+    assert main(["filter", str(said.folder), "--list", str(tmp_path / "good.txt")]) == 2
+    out, err = capsys.readouterr()
+    assert not out
     assert err.count("\n") == 1
-    assert "0002.jpg" in err
+    assert re.search(r"2 images called 0002\.jpg in .*, 1 of them kept and 1 not", err)
 
 
 @pytest.mark.xfail(reason="an empty points3D.txt is refused as cut short")
