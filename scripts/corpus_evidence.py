@@ -33,6 +33,7 @@ from sfm_audit.audit.misfit.pooled import ImageDesign
 from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.normality import normality_tests
 from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
+from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders import ModelRef, SparseModel, open_model
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.camera_models import BY_NAME
@@ -64,7 +65,7 @@ class AuditedModel:
     @property
     def num_rejected(self) -> int:
         """Images that the policy rejects."""
-        return int((self.images.verdict == "rejected").sum())
+        return int((self.images.verdict == Verdict.REJECTED).sum())
 
     @property
     def share_rejected(self) -> float:
@@ -80,7 +81,7 @@ def audit_for_report(name: str, ref: ModelRef, *, refit: Sequence[str] = ()) -> 
     images, cameras = tables.images.to_pandas(), tables.cameras.to_pandas()
     row = tables.models.to_pylist()[0]
     numbers = summary_numbers(images)
-    if (images.verdict == "rejected").mean() > 0.5:
+    if (images.verdict == Verdict.REJECTED).mean() > 0.5:
         numbers |= evidence(auditor)
         for camera_model in refit:
             numbers |= refit_numbers(model, camera_model)
@@ -115,10 +116,15 @@ def summary_numbers(images: pd.DataFrame) -> dict[str, float]:
         "unverifiable": (images.num_unverifiable / images.num_inliers).median(),
         "folds": float(images.folds_over.fillna(value=False).sum()),
     }
-    for column in ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible"):
-        numbers[f"rejected_{column.removeprefix('verdict_')}"] = float((images[column] == "rejected").sum())
+    for member in (member for member in Member if member is not Member.OUTSIDE):
+        numbers[f"rejected_{member.short}"] = float((images[member] == Verdict.REJECTED).sum())
+    numbers["undetermined_plausible"] = float((images.plausible == Verdict.UNDETERMINED).sum())
+    for name in ("deg", "centre", "focal_rel"):
+        numbers[f"worth_{name}"] = images[f"misfit_worth_{name}"].astype(float).abs().median()
+    numbers["misfit_px"] = images.misfit_px.median()
     for group in GROUPS:
         numbers[f"{group}_px"] = images[f"misfit_{group}_px"].median()
+        numbers[f"joint_{group}_px"] = images[f"misfit_{group}_px_joint"].median()
         numbers[f"cause_{group}"] = float((images.misfit_group == group).sum())
     return {name: float(value) for name, value in numbers.items()}
 

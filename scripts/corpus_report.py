@@ -23,9 +23,10 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
+from scripts import corpus_before
 from scripts.corpus_evidence import AuditedModel, audit_for_report
-from scripts.corpus_explanations import EXPLANATIONS
-from sfm_audit.audit.misfit import GROUPS
+from scripts.corpus_explanations import ENDED, EXPLANATIONS
+from sfm_audit.audit.table.words import GROUPS, Member, Verdict
 from sfm_audit.loaders import LoadError, ModelRef, discover
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -40,7 +41,7 @@ QUICK_MODELS: Final = (
 )
 LEVEL: Final = 0.05
 MOST: Final = 0.5  # of the images rejected: above it somebody has to say why
-VERDICTS: Final = ("verdict_ks", "verdict_misfit", "verdict_pose", "plausible")
+ASKED: Final = tuple(member for member in Member if member is not Member.OUTSIDE)
 NOISE_INTRO: Final = """\
 For every model with at least {least} inliers in its median image: share of images that a test rejects at 5 %, and the
 median excess kurtosis of an image's standardised residuals, under three noise models (images whose points are exact
@@ -50,14 +51,23 @@ what the 3D points took from the residuals. *track*: (5), noise predicted from t
 fitted spread and scale of the noise of tracks; removable: share of the squared residuals that moving the 3D points
 alone would remove (0: the points are at their optimum)."""
 VERDICT_INTRO: Final = """\
-Default settings: noise `track`, policy `full`, tau 0.2 px. A/R/U: images accepted, rejected, undetermined. ks, misfit,
-pose, plausible: images that this verdict rejects (an image can be rejected by several). Camera finding: what the pooled
-test says of a shared camera (its cause, px, q, from 0.05 px on); for cameras with one image each, how often which cause
-was named. Advice: COLMAP model that holds what was found."""
+Default settings: noise `track`, policy `standard`, tau 0.2 px. A/R/U: images accepted, rejected, undetermined; beside
+it the same by version 0.1.0. misfit, camera, pose, plausible, noise, ks: images that this verdict rejects (an image can
+be rejected by several; ks decides nothing under `standard`). Camera finding: what the pooled test says of a shared
+camera (its cause, px, q, from 0.05 px on); for cameras with one image each, how often which cause was named. Advice:
+COLMAP model that holds what was found."""
+BEFORE_INTRO: Final = """\
+The same models by version 0.1.0 (commit fbf7037, policy `full`: KS at 5 %, images tested one by one with the points as
+they are, deviations conditional on the points) and now (policy `standard`: the joint system of method.md, section 11).
+A share that is rejected here is no error rate: nobody knows the truth of these models
+([realtruth.md](realtruth.md) has models where it is known)."""
+LISTED: Final = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.UNDETERMINED)
 EXPLAIN_INTRO: Final = """\
 Written by a person, about every model of which more than half of the images is rejected. The numbers in the texts are
 of this run; the script checks that they still support what is said. Words used:
 
+- *joint*: from the joint test, what nothing else could take up, as the verdict and the table have it.
+- *as it stands*: of the image alone, points as they are, which hide a third of a field. The texts' px unless said.
 - *common px*: RMS length of the field that all images have in common, each image's own pose and intrinsics profiled.
   A lens that is wrong in all images shows there; motion, which differs from image to image, does not.
 - *beyond rolling shutter*: the smooth field that is left when a pose that changes linearly from row to row was allowed.
@@ -111,7 +121,7 @@ def noise_rows(models: Sequence[AuditedModel]) -> pd.DataFrame:
     """One row per model: what METHOD 3b promises of the noise models."""
     rows = {}
     for model in models:
-        images = model.images[model.images.verdict_ks != "undetermined"]
+        images = model.images[model.images.verdict_ks != Verdict.UNDETERMINED]
         if not len(images) or images.num_inliers.median() < MIN_INLIERS:
             continue
         white = model.whitened.loc[images.index]
@@ -162,16 +172,9 @@ def _cell(column: str, value: float) -> str:
 def verdict_part(models: Sequence[AuditedModel]) -> list[str]:
     """The table of verdicts."""
     head = (
-        "model",
-        "cameras",
-        "A/R/U",
-        "ks",
-        "misfit",
-        "pose",
-        "plausible",
-        "most frequent reasons",
-        "camera finding",
-        "advice",
+        *("model", "cameras", "A/R/U", "0.1.0"),
+        *(member.short for member in ASKED),
+        *("most frequent reasons", "camera finding", "advice"),
     )
     out = [
         "## Verdicts",
@@ -179,18 +182,48 @@ def verdict_part(models: Sequence[AuditedModel]) -> list[str]:
         VERDICT_INTRO,
         "",
         "| " + " | ".join(head) + " |",
-        "|---|---|---:|" + "---:|" * 4 + "---|---|---|",
+        "|---|---|---:|---:|" + "---:|" * len(ASKED) + "---|---|---|",
     ]
     for model in models:
-        images = model.images
-        counts = "/".join(str((images.verdict == v).sum()) for v in ("accepted", "rejected", "undetermined"))
-        rejected = " | ".join(str((images[column] == "rejected").sum()) for column in VERDICTS)
-        texts = " | ".join((_reasons(model), _finding(model), _advice(model)))
-        out.append(f"| {model.name} | {_cameras(model)} | {counts} | {rejected} | {texts} |")
+        texts = (_reasons(model), _finding(model), _advice(model))
+        known = (model.name, _cameras(model), _counts(model.images), corpus_before.VERDICTS.get(model.name, "-"))
+        out.append("| " + " | ".join((*known, *_rejected_by(model.images), *texts)) + " |")
     total = pd.concat([model.images for model in models])
-    counts = "/".join(str((total.verdict == v).sum()) for v in ("accepted", "rejected", "undetermined"))
-    rejected = " | ".join(str((total[column] == "rejected").sum()) for column in VERDICTS)
-    return [*out, f"| **{len(models)} models** | | {counts} | {rejected} | | | |"]
+    known = (f"**{len(models)} models**", "", _counts(total), _counts_before())
+    return [*out, "| " + " | ".join((*known, *_rejected_by(total), "", "", "")) + " |"]
+
+
+def _counts(images: pd.DataFrame) -> str:
+    return "/".join(str((images.verdict == verdict).sum()) for verdict in LISTED)
+
+
+def _counts_before() -> str:
+    return "/".join(map(str, np.array([said.split("/") for said in corpus_before.VERDICTS.values()], int).sum(axis=0)))
+
+
+def _rejected_by(images: pd.DataFrame) -> list[str]:
+    return [str((images[member] == Verdict.REJECTED).sum()) for member in ASKED]
+
+
+def before_part(models: Sequence[AuditedModel]) -> list[str]:
+    """Shares rejected and undetermined, before and now, per verdict and reason."""
+    images = pd.concat([model.images for model in models])
+    rows: list[tuple[str, int | None, int]] = []
+    for verdict, then in zip(LISTED, _counts_before().split("/"), strict=True):
+        rows.append((str(verdict), int(then), int((images.verdict == verdict).sum())))
+    for member in ASKED:
+        now = int((images[member] == Verdict.REJECTED).sum())
+        rows.append((f"rejected by {member}", corpus_before.REJECTED.get(member), now))
+    doubts = images[images.verdict == Verdict.UNDETERMINED].reasons
+    for code, num in corpus_before.UNDETERMINED.items():
+        now = sum(any(reason.startswith(code) for reason in said) for said in doubts)
+        rows.append((f"undetermined, {code}", num, now))
+    out = ["## Before and now", "", BEFORE_INTRO, "", "| images | 0.1.0 | now |", "|---|---:|---:|"]
+    return [*out, *(f"| {words} | {_of(then, len(images))} | {_of(now, len(images))} |" for words, then, now in rows)]
+
+
+def _of(num: int | None, total: int) -> str:
+    return "-" if num is None else f"{num} ({num / total:.0%})"
 
 
 def _cameras(model: AuditedModel) -> str:
@@ -214,12 +247,14 @@ def _finding(model: AuditedModel) -> str:
             if isinstance(c.misfit_group, str)
         ]
         return "; ".join(found) or "none"
-    causes = Counter(group for group in cameras.misfit_group if isinstance(group, str))
+    named = model.images.misfit_group[model.images[Member.MISFIT] == Verdict.REJECTED]
+    causes = Counter(named)
     return ", ".join(f"{group} {count}" for group, count in causes.most_common(3)) or "none"
 
 
 def _advice(model: AuditedModel) -> str:
-    counts = Counter(advice for advice in model.cameras.advised_camera_model if isinstance(advice, str))
+    table = model.cameras if len(model.cameras) <= 2 else model.images
+    counts = Counter(advice for advice in table.advised_camera_model if isinstance(advice, str))
     if len(model.cameras) == 1:
         return next(iter(counts), "-")
     return ", ".join(f"{advice} ({count})" for advice, count in counts.most_common(3)) or "-"
@@ -242,7 +277,13 @@ def evidence_part(models: Sequence[AuditedModel]) -> list[str]:
         *("smooth beyond rolling shutter", "smooth by observations", "by cells", "neighbours", "persistence"),
     )
     keys = (
-        *("sigma_px", *(f"{group}_px" for group in GROUPS), "common_radial_px", "common_smooth_px", "beyond_rs_px"),
+        *(
+            "sigma_px",
+            *(f"joint_{group}_px" for group in GROUPS),
+            "common_radial_px",
+            "common_smooth_px",
+            "beyond_rs_px",
+        ),
         *("by_observations", "by_cells", "neighbours", "persistence"),
     )
     out = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * len(keys)]
@@ -272,6 +313,18 @@ def explanations_part(models: Sequence[AuditedModel]) -> tuple[list[str], list[s
         twin = told.setdefault(id(explanation), model.name)
         text = explanation.told(model.numbers) if twin == model.name else f"The same reconstruction as {twin}."
         out += [_paragraph(f"**{model.name}** ({model.num_rejected} of {len(model.images)} rejected). {text}"), ""]
+    return out[:-1], problems
+
+
+def ended_part(models: Sequence[AuditedModel]) -> tuple[list[str], list[str]]:
+    """What version 0.1.0 rejected by KS, and what is said of it now; and claims that the numbers do not support."""
+    out, problems = ["## What KS alone rejected before", ""], []
+    for model in models:
+        if model.name in ENDED:
+            explanation = ENDED[model.name]
+            problems += [f"{model.name}: {line}" for line in explanation.unsupported(model.numbers)]
+            counts = f"{_counts(model.images)}, before {corpus_before.VERDICTS.get(model.name, '-')}"
+            out += [_paragraph(f"**{model.name}** ({counts}). {explanation.told(model.numbers)}"), ""]
     return out[:-1], problems
 
 
@@ -313,6 +366,8 @@ def main() -> int:
         print("" if models else f"skipped: none of {', '.join(QUICK_MODELS)} is there")
     else:
         explained, problems = explanations_part(models)
+        ended, more = ended_part(models)
+        problems += more
         total = sum(len(model.images) for model in models)
         intro = [
             "# What the audit says of public models",
@@ -322,7 +377,10 @@ def main() -> int:
             f"{len(models)} reconstructions, {total} images: public models of other people, and a few made for this",
             "project from public photos. None of them is part of this repository.",
         ]
-        parts = [intro, noise_part(models), verdict_part(models), explained, findings_part(models, failures)]
+        parts = [
+            *(intro, before_part(models), verdict_part(models), explained, ended),
+            *(noise_part(models), findings_part(models, failures)),
+        ]
         args.out.write_text("\n\n".join("\n".join(part) for part in parts) + "\n", encoding="utf-8")
     for line in problems:
         print("NOT SUPPORTED:" if not args.quick else "OUT OF BAND:", line, file=sys.stderr)
