@@ -54,14 +54,8 @@ VERDICT_INTRO: Final = """\
 Default settings: noise `track`, policy `standard`, tau 0.2 px. A/R/U: images accepted, rejected, undetermined; beside
 it the same by version 0.1.0. misfit, camera, pose, plausible, noise, ks: images that this verdict rejects (an image can
 be rejected by several; ks decides nothing under `standard`). Camera finding: what the pooled test says of a shared
-camera (its cause, px, q, from 0.05 px on); for cameras with one image each, how often which cause was named. Advice:
-COLMAP model that holds what was found."""
-BEFORE_INTRO: Final = """\
-The same models by version 0.1.0 (commit fbf7037, policy `full`: KS at 5 %, images tested one by one with the points as
-they are, deviations conditional on the points) and now (policy `standard`: the joint system of method.md, section 11).
-A share that is rejected here is no error rate: nobody knows the truth of these models
-([realtruth.md](realtruth.md) has models where it is known)."""
-LISTED: Final = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.UNDETERMINED)
+camera (its cause, px, q, from 0.05 px on); for cameras with one image each, how often which cause
+is named of images that misfit rejects. Advice: COLMAP model that holds what was found."""
 EXPLAIN_INTRO: Final = """\
 Written by a person, about every model of which more than half of the images is rejected. The numbers in the texts are
 of this run; the script checks that they still support what is said. Words used:
@@ -189,41 +183,16 @@ def verdict_part(models: Sequence[AuditedModel]) -> list[str]:
         known = (model.name, _cameras(model), _counts(model.images), corpus_before.VERDICTS.get(model.name, "-"))
         out.append("| " + " | ".join((*known, *_rejected_by(model.images), *texts)) + " |")
     total = pd.concat([model.images for model in models])
-    known = (f"**{len(models)} models**", "", _counts(total), _counts_before())
+    known = (f"**{len(models)} models**", "", _counts(total), corpus_before.counts())
     return [*out, "| " + " | ".join((*known, *_rejected_by(total), "", "", "")) + " |"]
 
 
 def _counts(images: pd.DataFrame) -> str:
-    return "/".join(str((images.verdict == verdict).sum()) for verdict in LISTED)
-
-
-def _counts_before() -> str:
-    return "/".join(map(str, np.array([said.split("/") for said in corpus_before.VERDICTS.values()], int).sum(axis=0)))
+    return "/".join(str((images.verdict == verdict).sum()) for verdict in corpus_before.LISTED)
 
 
 def _rejected_by(images: pd.DataFrame) -> list[str]:
     return [str((images[member] == Verdict.REJECTED).sum()) for member in ASKED]
-
-
-def before_part(models: Sequence[AuditedModel]) -> list[str]:
-    """Shares rejected and undetermined, before and now, per verdict and reason."""
-    images = pd.concat([model.images for model in models])
-    rows: list[tuple[str, int | None, int]] = []
-    for verdict, then in zip(LISTED, _counts_before().split("/"), strict=True):
-        rows.append((str(verdict), int(then), int((images.verdict == verdict).sum())))
-    for member in ASKED:
-        now = int((images[member] == Verdict.REJECTED).sum())
-        rows.append((f"rejected by {member}", corpus_before.REJECTED.get(member), now))
-    doubts = images[images.verdict == Verdict.UNDETERMINED].reasons
-    for code, num in corpus_before.UNDETERMINED.items():
-        now = sum(any(reason.startswith(code) for reason in said) for said in doubts)
-        rows.append((f"undetermined, {code}", num, now))
-    out = ["## Before and now", "", BEFORE_INTRO, "", "| images | 0.1.0 | now |", "|---|---:|---:|"]
-    return [*out, *(f"| {words} | {_of(then, len(images))} | {_of(now, len(images))} |" for words, then, now in rows)]
-
-
-def _of(num: int | None, total: int) -> str:
-    return "-" if num is None else f"{num} ({num / total:.0%})"
 
 
 def _cameras(model: AuditedModel) -> str:
@@ -349,6 +318,32 @@ def check_bands(models: Sequence[AuditedModel]) -> list[str]:
     ]
 
 
+def document(models: Sequence[AuditedModel], failures: Sequence[str]) -> tuple[str, list[str]]:
+    """Return the page, and what is wrong with its texts."""
+    explained, problems = explanations_part(models)
+    ended, more = ended_part(models)
+    total = sum(len(model.images) for model in models)
+    intro = [
+        "# What the audit says of public models",
+        "",
+        "Made by `scripts/corpus_report.py`; do not edit.",
+        "",
+        f"{len(models)} reconstructions, {total} images: public models of other people, and a few made for this",
+        "project from public photos. None of them is part of this repository.",
+    ]
+    parts = [
+        *(
+            intro,
+            corpus_before.page_part(pd.concat([model.images for model in models])),
+            verdict_part(models),
+            explained,
+            ended,
+        ),
+        *(noise_part(models), findings_part(models, failures)),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n", [*problems, *more]
+
+
 def main() -> int:
     """Write the page, or check."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -365,23 +360,8 @@ def main() -> int:
         problems = check_bands(models) if models else []
         print("" if models else f"skipped: none of {', '.join(QUICK_MODELS)} is there")
     else:
-        explained, problems = explanations_part(models)
-        ended, more = ended_part(models)
-        problems += more
-        total = sum(len(model.images) for model in models)
-        intro = [
-            "# What the audit says of public models",
-            "",
-            "Made by `scripts/corpus_report.py`; do not edit.",
-            "",
-            f"{len(models)} reconstructions, {total} images: public models of other people, and a few made for this",
-            "project from public photos. None of them is part of this repository.",
-        ]
-        parts = [
-            *(intro, before_part(models), verdict_part(models), explained, ended),
-            *(noise_part(models), findings_part(models, failures)),
-        ]
-        args.out.write_text("\n\n".join("\n".join(part) for part in parts) + "\n", encoding="utf-8")
+        text, problems = document(models, failures)
+        args.out.write_text(text, encoding="utf-8")
     for line in problems:
         print("NOT SUPPORTED:" if not args.quick else "OUT OF BAND:", line, file=sys.stderr)
     return 1 if problems else 0
