@@ -22,12 +22,10 @@ from sfm_audit.audit.decision.diagnostics import (
 )
 from sfm_audit.audit.table.columns import own_parameter_names
 from sfm_audit.audit.table.thresholds import SINGULAR_SHARE
-from sfm_audit.audit.table.words import GROUPS, Member, MisfitGroup, MisfitStatus, Reason, ReasonCode
+from sfm_audit.audit.table.words import GROUPS, UNUSABLE, Member, MisfitGroup, MisfitStatus, Reason, ReasonCode
 from sfm_audit.loaders.camera_models import BY_NAME, CameraModel
 
 Row = Mapping[str, Any]
-
-_UNUSABLE: Final = (ReasonCode.NON_FINITE_POSE, ReasonCode.MISSING_CAMERA, ReasonCode.NON_FINITE_CAMERA)
 
 READ_COLUMNS: Final = (
     *("camera_model", "width", "height", "params", "num_inliers", "max_px", "coverage", "occupied_cells"),
@@ -68,7 +66,7 @@ def diagnostics_of_row(row: Row) -> Diagnostics:
         camera=_camera(row, is_joint=own is not None),
         largest_residual_px=number_of(row["max_px"]),
         longer_side_px=max(row["width"] or 0, row["height"] or 0),
-        unusable=_first(reasons, _UNUSABLE),
+        unusable=_first(reasons, UNUSABLE),
         consistency=None if row[Member.CAMERA] is None else _consistency(reasons),
         own=own,
         has_own=row["folds_over"] is not None and bool(_own_names(BY_NAME[row["camera_model"]])),

@@ -305,6 +305,16 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
     ),
 }
 
+UNUSABLE: Final = frozenset(
+    {
+        ReasonCode.NON_FINITE_POSE,
+        ReasonCode.NON_FINITE_CAMERA,
+        ReasonCode.MISSING_CAMERA,
+        ReasonCode.EXTREME_VALUES,
+    }
+)
+"""Nothing can be projected, whatever the settings are: in the way of every question."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reason:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -13,13 +15,14 @@ from joint_reference import with_param
 
 from sfm_audit.audit import AuditConfig, audit_model
 from sfm_audit.audit.decision.from_table import FixedSettingError, MissingColumnError, RedecisionError, redecide
+from sfm_audit.audit.engine import image
 from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
 from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
 from sfm_audit.audit.simulate.demo import demo_scene
 from sfm_audit.audit.simulate.noise import NoiseSpec
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 from sfm_audit.audit.table import schema
-from sfm_audit.audit.table.words import POLICIES, SEVERITY_ORDER, Verdict
+from sfm_audit.audit.table.words import POLICIES, SEVERITY_ORDER, UNUSABLE, ReasonCode, Verdict
 
 RUN = AuditConfig()
 SPEC = SceneSpec(num_images=12, points_per_image=150, noise=NoiseSpec(sigma_px=0.5))
@@ -63,7 +66,7 @@ def broken():
     changed = replace(
         images, quat_cam_from_world_wxyz=quat, translation_cam_from_world=translation, camera_idx=camera_idx
     )
-    return with_param(replace(model, images=changed), 6, 0, np.nan)
+    return with_param(with_param(replace(model, images=changed), 6, 0, np.nan), 8, 0, 1e13)
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +94,14 @@ def test_the_demo_decides_as_it_did():
 
 def test_all_that_stands_in_the_way_is_kept(broken_images):
     codes = {item["code"] for row in broken_images.column("reason_details").to_pylist() for item in row}
-    assert {"non_finite_pose", "missing_camera", "non_finite_camera", "inconsistent"} <= codes
+    assert UNUSABLE | {"inconsistent"} <= codes
     assert codes & {"camera_not_optimal", "pose_not_optimal"}
     assert_same(redecide(broken_images, RUN, run=RUN), broken_images)
+
+
+def test_what_makes_an_image_unusable_is_known_by_its_codes():
+    source = Path(image.__file__).read_text()
+    assert {ReasonCode[name] for name in re.findall(r"_unusable_reason\(ReasonCode\.(\w+)", source)} == UNUSABLE
 
 
 def test_a_model_that_lies_behind_its_cameras_stays_there():
