@@ -12,8 +12,10 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.banded import BandedInverse
+from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
-from sfm_audit.audit.joint.inverse import JointInverse, joint_inverse
+from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_inverse
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
@@ -59,15 +61,12 @@ class JointSystem:
     """The base system of a model: poses, own parameters of the cameras, points (method.md (6)).
 
     model, residuals: what it was built from.    base: with the weights of (6).
-    reduced: S and g with these weights.    meat: (D, D) M, clustered by track.
     plain_step: (D,) the step with w = 1: what a least-squares adjuster would take.
     """
 
     model: SparseModel
     residuals: ModelResiduals
     base: Base
-    reduced: ReducedSystem
-    meat: sparse.csr_array
     plain_step: FloatArray
 
     @property
@@ -117,22 +116,35 @@ class JointSystem:
         return out
 
     def covariances(self, blocks: Sequence[IntArray]) -> list[FloatArray]:
-        """Return the sandwich S^+ M S^+ (k, k) at each block of columns (k,); NaN where one is not identified."""
-        inverse, out = self.base.inverse, []
-        for batch in _batches(blocks):
-            columns = np.concatenate(batch)
-            rows = inverse.main.rows(columns)
-            spread = (self.meat @ np.ascontiguousarray(rows.T)).T
-            start = 0
-            for block in batch:
-                own = slice(start, start + block.size)
-                start = own.stop
-                covariance = rows[own] @ spread[own].T
-                lost = inverse.unidentified[block]
-                covariance[lost] = np.nan
-                covariance[:, lost] = np.nan
-                out.append(0.5 * (covariance + covariance.T))
+        """Return the sandwich S^+ M S^+ (k, k) at each block of columns (k,), M clustered by track.
+
+        NaN where a parameter is not identified.
+        """
+        if not blocks:
+            return []
+        inverse, meat = self.base.inverse, score_meat(self.observations, self.base.left_px)
+        found = None
+        if isinstance(inverse.main, BandedInverse) and not inverse.num_null:
+            found = banded_sandwiches(inverse.main, meat, blocks)
+        out = []
+        for block, covariance in zip(blocks, found or _sandwiches(inverse.main, meat, blocks), strict=True):
+            lost = inverse.unidentified[block]
+            covariance[lost] = np.nan
+            covariance[:, lost] = np.nan
+            out.append(0.5 * (covariance + covariance.T))
         return out
+
+
+def _sandwiches(main: SymmetricInverse, meat: sparse.csr_array, blocks: Sequence[IntArray]) -> Iterator[FloatArray]:
+    """The same by rows of the inverse, some at once."""
+    for batch in _batches(blocks):
+        rows = main.rows(np.concatenate(batch))
+        spread = (meat @ np.ascontiguousarray(rows.T)).T
+        start = 0
+        for block in batch:
+            own = slice(start, start + block.size)
+            start = own.stop
+            yield rows[own] @ spread[own].T
 
 
 def _batches(blocks: Sequence[IntArray]) -> Iterator[list[IntArray]]:
@@ -183,7 +195,7 @@ def joint_system(
     base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
     plain_step = _plain_step(plain, base, gauge)
     del plain
-    return JointSystem(model, residuals, base, reduced, score_meat(observations, base.left_px), plain_step)
+    return JointSystem(model, residuals, base, plain_step)
 
 
 def with_step(base: Base, step: FloatArray) -> Base:

@@ -11,8 +11,10 @@ from numpy.testing import assert_allclose
 
 from sfm_audit.audit.joint import inverse as joint_inverses
 from sfm_audit.audit.joint.banded import BandedInverse, band_of
+from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
+from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
 
@@ -24,13 +26,19 @@ def street():
 
 
 @pytest.fixture(scope="module")
-def scale(street):
-    return np.sqrt(street.reduced.matrix.diagonal())
+def reduced(street):
+    return reduced_systems(street.observations)[0]
+
+
+@pytest.fixture(scope="module")
+def scale(reduced):
+    return np.sqrt(reduced.matrix.diagonal())
 
 
 def inverted(system, *, dead=(), matrix=None):
-    matrix = system.reduced.matrix if matrix is None else matrix
-    before = system.reduced.before.copy()
+    reduced, _ = reduced_systems(system.observations)
+    matrix = reduced.matrix if matrix is None else matrix
+    before = reduced.before.copy()
     before[list(dead)] *= 1e20
     return joint_inverse(matrix, before, gauge_directions(system.model, system.observations))
 
@@ -41,21 +49,21 @@ def dense(street, monkeypatch):
     return inverted(street)
 
 
-def test_a_street_is_a_band_and_a_room_is_none(street):
-    band = band_of(street.reduced.matrix)
-    row, column = street.reduced.matrix.nonzero()
+def test_a_street_is_a_band_and_a_room_is_none(street, reduced):
+    band = band_of(reduced.matrix)
+    row, column = reduced.matrix.nonzero()
     assert band is not None
     assert np.abs(band.place[row] - band.place[column]).max() == band.width
     assert (band.order[band.place] == np.arange(len(band.order))).all()
     room = system_of(model_of(dataclasses.replace(SPEC, num_images=12), seed=1))
-    assert band_of(room.reduced.matrix) is None
+    assert band_of(reduced_systems(room.observations)[0].matrix) is None
     assert isinstance(street.base.inverse.main, BandedInverse)
     assert isinstance(room.base.inverse.main, DenseInverse)
 
 
-def test_it_is_the_pseudo_inverse(street, scale):
+def test_it_is_the_pseudo_inverse(street, reduced, scale):
     """In units of unit diagonal, by numpy's eigendecomposition; whatever is asked for."""
-    unit = street.reduced.matrix.toarray() / scale / scale[:, None]
+    unit = reduced.matrix.toarray() / scale / scale[:, None]
     expected = np.linalg.pinv(unit, rcond=1e-11, hermitian=True)
     main, size = street.base.inverse.main, len(scale)
     tolerance = {"atol": 1e-8 * np.abs(expected).max()}
@@ -95,13 +103,32 @@ def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
     assert_allclose(found.main.block(columns), expected.main.block(columns), rtol=1e-6, atol=1e-30)
 
 
-def test_a_further_null_direction_is_found_in_a_band_too(street):
+def test_a_further_null_direction_is_found_in_a_band_too(street, reduced):
     """A parameter made a copy of another one of its camera: S of x_a + x_b alone."""
     first, second = street.observations.layout.own_of_camera(30)
-    merge = np.eye(len(street.reduced.right))
+    merge = np.eye(len(reduced.right))
     merge[second] = merge[first]
-    matrix = type(street.reduced.matrix)(merge @ street.reduced.matrix.toarray() @ merge.T)
+    matrix = type(reduced.matrix)(merge @ reduced.matrix.toarray() @ merge.T)
     found = inverted(street, matrix=matrix)
     assert isinstance(found.main, BandedInverse)
     assert found.num_null == 1
     assert {int(first), int(second)} <= set(np.flatnonzero(found.unidentified).tolist())
+
+
+def test_covariances_are_the_sandwich_by_numpy(street, reduced, scale):
+    """S^+ M S^+ at the columns of every image and of every camera, in units of unit diagonal."""
+    meat = score_meat(street.observations, street.base.left_px).toarray() / scale / scale[:, None]
+    unit = np.linalg.pinv(reduced.matrix.toarray() / scale / scale[:, None], rcond=1e-11, hermitian=True)
+    expected, layout = unit @ meat @ unit, street.observations.layout
+    blocks = [*layout.columns, *(layout.own_of_camera(k) for k in range(60))]
+    found = banded_sandwiches(street.base.inverse.main, score_meat(street.observations, street.base.left_px), blocks)
+    for block, own, public in zip(blocks, found, street.covariances(blocks), strict=True):
+        both = scale[block] * scale[block][:, None]
+        assert_allclose(own * both, expected[np.ix_(block, block)], atol=1e-8 * np.abs(expected).max())
+        assert_allclose(public, own, rtol=1e-9, atol=1e-12 * np.abs(own).max())
+
+
+def test_blocks_of_columns_that_lie_apart_have_the_same_covariance(street):
+    apart = np.concatenate([street.observations.layout.columns[3], street.observations.layout.columns[50]])
+    (both,), (first,) = street.covariances([apart]), street.covariances([apart[:8]])
+    assert_allclose(both[:8, :8], first, rtol=1e-6)

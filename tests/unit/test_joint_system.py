@@ -18,6 +18,7 @@ from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.group_test import test_group as judge_group
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.inverse import joint_inverse
+from sfm_audit.audit.joint.normal import reduced_systems
 from sfm_audit.audit.joint.worth import worth_of
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
@@ -200,7 +201,8 @@ def test_inclusion_leaves_the_base_system_as_it_was(system):
 
 
 def test_seven_directions_of_the_gauge_and_no_others(system):
-    matrix = system.reduced.matrix.toarray()
+    reduced = reduced_systems(system.observations)[0]
+    matrix = reduced.matrix.toarray()
     scale = np.sqrt(matrix.diagonal())
     values = np.linalg.eigvalsh(matrix / scale / scale[:, None])
     assert values[6] < 1e-11 < values[7]
@@ -209,7 +211,8 @@ def test_seven_directions_of_the_gauge_and_no_others(system):
 
 
 def test_pseudo_inverse_is_one(system):
-    matrix, inverse = system.reduced.matrix.toarray(), system.base.inverse.main.array
+    matrix = reduced_systems(system.observations)[0].matrix.toarray()
+    inverse = system.base.inverse.main.array
     scale = np.sqrt(matrix.diagonal())
     unit, back = matrix / scale / scale[:, None], inverse * scale * scale[:, None]
     assert_allclose(unit @ back @ unit, unit, atol=1e-9)
@@ -218,14 +221,15 @@ def test_pseudo_inverse_is_one(system):
 
 def test_a_further_null_direction_is_found_and_said(system):
     """A column twice: neither of the two is known, all others are what they were without the second."""
-    matrix = system.reduced.matrix.toarray()
+    reduced = reduced_systems(system.observations)[0]
+    matrix = reduced.matrix.toarray()
     size, twice = len(matrix), int(system.observations.layout.own_of_camera(0)[0])
     index = np.append(np.arange(size), twice)
-    doubled = type(system.reduced.matrix)(matrix[np.ix_(index, index)])
+    doubled = type(reduced.matrix)(matrix[np.ix_(index, index)])
     gauge = np.zeros((size + 1, 7))
     values, vectors = np.linalg.eigh(matrix / np.sqrt(np.outer(matrix.diagonal(), matrix.diagonal())))
     gauge[:size] = vectors[:, :7] / np.sqrt(matrix.diagonal())[:, None]
-    inverse = joint_inverse(doubled, system.reduced.before[index], gauge)
+    inverse = joint_inverse(doubled, reduced.before[index], gauge)
     assert values[7] > 1e-11
     assert inverse.num_null == 1
     assert np.flatnonzero(inverse.unidentified).tolist() == [twice, size]
