@@ -18,7 +18,7 @@ WORDS = (
     "planted, 0.5 px and more, found",
     "cause named right",
     "focal length wrong by over 1 %, accepted, without kitti2",
-    "healthy, f within 0.5 %, accepted, not temple",
+    "healthy, f within 0.5 %, accepted, without temple",
     "absorbed principal point, finding implied_principal_point",
     "healthy models with implied_principal_point",
 )

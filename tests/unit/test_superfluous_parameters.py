@@ -26,7 +26,6 @@ CAMERA = CameraDiagnostics(
     focal_over_size=0.8,
     folds_over=False,
     principal_point_px=(800.0, 600.0),
-    principal_point_outside=False,
     size_px=(1600, 1200),
     coverage=0.5,
     occupied_cells=40,
