@@ -101,7 +101,7 @@ def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
     return Decision(members, judgement, found, severity, pose_first)
 
 
-def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName, *, pose_first: bool = False) -> Judgement:
+def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName, *, pose_first: bool) -> Judgement:
     """Return rejected if any member rejects, else undetermined if any is, else accepted; each reason once."""
     order = list(POLICIES[policy])
     if pose_first and Member.POSE in order:

@@ -31,17 +31,10 @@ def differing(found: pa.Table, wanted: pa.Table) -> list[str]:
     ]
 
 
-def assert_decides_alike(folder: Path):
-    model = open_model(folder)
-    images, other = audit_model(model, RUN).images, audit_model(model, OTHER).images
-    assert differing(redecide(images, RUN, run=RUN), images) == []
-    assert differing(redecide(images, OTHER, run=RUN), other) == []
-    assert differing(redecide(other, RUN, run=OTHER), images) == []
-
-
 @parametrize_models()
 def test_a_real_model_decides_again_as_it_did(model_dir):
-    assert_decides_alike(model_dir)
+    images = audit_model(open_model(model_dir), RUN).images
+    assert differing(redecide(images, RUN, run=RUN), images) == []
 
 
 @pytest.mark.corpus
@@ -53,4 +46,8 @@ def test_a_symptom_decides_again_as_it_did(case, tmp_path):
         folder = tmp_path / "model"
         done = subprocess.run([sys.executable, case.name, folder], cwd=case.parent, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
-    assert_decides_alike(folder)
+    model = open_model(folder)
+    images, other = audit_model(model, RUN).images, audit_model(model, OTHER).images
+    assert differing(redecide(images, RUN, run=RUN), images) == []
+    assert differing(redecide(images, OTHER, run=RUN), other) == []
+    assert differing(redecide(other, RUN, run=OTHER), images) == []

@@ -53,6 +53,7 @@ SHIFTS = (MisfitGroup.TANGENTIAL, MisfitGroup.PRINCIPAL_POINT)
 HALF = 0.5**0.5  # RMS of half a pixel in x and in y
 BELOW, ABOVE = (1.36 / math.sqrt(580) + 0.03 + side for side in (-1e-6, 1e-6))  # D of 290 observations
 ASKS_FOR_MEASUREMENTS = (M.MISFIT, M.CAMERA, M.NOISE, M.KS)
+EXCESS = 0.2 - 1.36 / math.sqrt(580)
 FEW = {"num_inliers": 3, "noise": replace(NOISE, num_standardised=3), "misfit": misfit(num_tested=3)}
 NOTHING = sound(num_inliers=0, noise=replace(NOISE, num_standardised=0), misfit=None, camera=None, own=None)
 
@@ -87,6 +88,10 @@ TABLE = [
     # verdict_noise
     (M.NOISE, noise(ks_stat=BELOW, ks_p=1e-9), {}, ACCEPTED, []),
     (M.NOISE, noise(ks_stat=ABOVE, ks_p=0.5), {}, REJECTED, [C.NOISE_DIFFERS]),
+    *(
+        (M.NOISE, sound(noise=noise(ks_stat=0.2).noise, half_pixel=half), {"max_noise_distance": EXCESS}, ACCEPTED, [])
+        for half in (False, True)
+    ),
     (M.NOISE, noise(ks_stat=ABOVE), {"max_noise_distance": 0.031}, ACCEPTED, []),
     (M.NOISE, noise(ks_stat=BELOW), {"max_noise_distance": 0.029}, REJECTED, [C.NOISE_DIFFERS]),
     (M.NOISE, noise(ks_stat=ABOVE, num_standardised=289), {}, ACCEPTED, []),
