@@ -28,7 +28,7 @@ from scripts.paper.motivating import SCALES as MOTIVATING_SCALES
 from scripts.paper.motivating import SIGMAS, SIZES
 from scripts.paper.rates import SCALES, TESTS, THIRDS, chosen, rates_by_third, rejects
 from scripts.paper.tables import CAMERAS, NUM_TRAIN, NUM_VIEWS, ROOM_MODELS
-from scripts.validation.page import table
+from scripts.validation.markdown import table
 from scripts.validation.study import Check
 
 STAND_FOR: Final = {"plain": "axisp3364", "wide": "axis223m"}
