@@ -11,7 +11,7 @@ import pandas as pd
 
 from scripts.validation.singles import EXACT_DEFECTS
 from scripts.validation.study import HOLDS, VIOLATED, Check, check
-from scripts.validation.truth import ALPHA, ANSWERS, CAMERA_DEFECTS, SIGMA_PX, SOUND, is_right
+from scripts.validation.truth import ALPHA, ANSWERS, CAMERA_DEFECTS, SIGMA_PX, SOUND, TAU_PX, is_right
 from sfm_audit.audit.misfit import GROUPS
 from sfm_audit.audit.simulate.defects import DefectKind
 from sfm_audit.audit.simulate.noise import NoiseKind
@@ -161,16 +161,18 @@ def _quarter(frame: pd.DataFrame) -> Iterator[Check]:
         hits = (frame[name] == "rejected")[sound]
         yield check(f"sound images rejected by {name.replace('_', ' ')}, {where}", "all noises", hits, 0.0, 0.005)
     large = frame["true_px"] >= _MATERIAL
-    yield check(f"images of >= {_LARGE} systematic error rejected, {where}", "all noises", rejected[large], 0.96)
-    found = frame[rejected & ~sound]
+    found = frame["effect_joint_px"] > TAU_PX
+    yield check(f"images of >= {_LARGE} found (effect above tau), {where}", "all noises", found[large], 0.96)
+    yield check(f"images of >= {_LARGE} rejected by verdict_misfit, {where}", "all noises", rejected[large], 0.96)
+    named = frame[(rejected | found) & ~sound]
     right = pd.Series(
-        [is_right(kind, name) for kind, name in zip(found["kind"], found["misfit_group"], strict=True)],
-        index=found.index,
+        [is_right(kind, name) for kind, name in zip(named["kind"], named["misfit_group"], strict=True)],
+        index=named.index,
         dtype=bool,
     )
     yield check(f"cause named right, {where}", "all kinds", right, 0.9)
     for kind in CAMERA_DEFECTS:
-        yield check(f"cause named right, each kind, {where}", str(kind), right[found["kind"] == str(kind)], 0.7)
+        yield check(f"cause named right, each kind, {where}", str(kind), right[named["kind"] == str(kind)], 0.7)
 
 
 def _no_defects(scenes: pd.DataFrame) -> Iterator[Check]:

@@ -56,12 +56,12 @@ def blame_section(scenes: pd.DataFrame) -> str:
 
 def _causes(quarter: pd.DataFrame) -> str:
     """How often each group was named, by what was planted."""
-    found, rows = quarter[(quarter["verdict_misfit"] == "rejected") & (quarter["kind"] != SOUND)], []
+    found, rows = quarter[(quarter["effect_joint_px"] > TAU_PX) & (quarter["kind"] != SOUND)], []
     for kind in CAMERA_DEFECTS:
         own = found[found["kind"] == str(kind)]
         counts = [str(int((own["misfit_group"] == str(group)).sum())) for group in GROUPS]
         rows.append((str(kind), str(len(own)), *counts, percent(float(right_answer(own).mean()))))
-    return table(("planted", "rejected", *(str(group).replace("_", " ") for group in GROUPS), "right"), rows)
+    return table(("planted", "found", *(str(group).replace("_", " ") for group in GROUPS), "right"), rows)
 
 
 def _blame_by_noise(quarter: pd.DataFrame) -> str:
@@ -71,25 +71,29 @@ def _blame_by_noise(quarter: pd.DataFrame) -> str:
         hit = part["verdict_misfit"] == "rejected"
         large = part["true_px"] >= 0.5
         standard = (part["policy_standard"] == "rejected")[sound]
-        shares = [percent(float(share.mean())) for share in (hit[sound], standard, hit[large], hit[~sound])]
+        above = part["effect_joint_px"] > TAU_PX
+        shown = (hit[sound], standard, above[large], hit[large], above[~sound], hit[~sound])
+        shares = [percent(float(share.mean())) for share in shown]
         rows.append((str(noise), str(int(sound.sum())), str(int((~sound).sum())), *shares))
-    header = ("noise", "sound", "wrong", "sound rejected", "by policy standard", "≥ 0.5 px rejected")
-    return table((*header, "all wrong rejected"), rows)
+    header = ("noise", "sound", "wrong", "sound rejected", "by policy standard", "≥ 0.5 px found", "rejected")
+    return table((*header, "all wrong found", "rejected"), rows)
 
 
 def _severity(quarter: pd.DataFrame) -> str:
-    """What the rejected images' misfits are worth, by true size."""
-    rejected, rows = quarter[(quarter["verdict_misfit"] == "rejected") & (quarter["kind"] != SOUND)], []
+    """What the misfits that were found are worth, and what follows, by true size."""
+    found, rows = quarter[(quarter["effect_joint_px"] > TAU_PX) & (quarter["kind"] != SOUND)], []
     for (low, high), name in zip(CLASSES, _CLASS_NAMES, strict=True):
-        own = rejected[rejected["true_px"].between(low, high)]
+        own = found[found["true_px"].between(low, high)]
         if own.empty:
             continue
-        shares = [percent(float((own["severity"] == severity).mean())) for severity in Severity]
         ratio = (own["effect_joint_px"] / own["true_px"]).quantile([0.05, 0.5, 0.95])
-        worth = (own["misfit_worth_deg"].median(), 100 * own["misfit_worth_focal_rel"].abs().median())
-        rows.append((name, str(len(own)), *(f"{r:.2f}" for r in ratio), *(f"{w:.3f}" for w in worth), *shares))
-    header = ("true size", "rejected", "effect / truth 5 %", "median", "95 %", "rotation, degrees", "f, %")
-    return table((*header, *(str(severity) for severity in Severity)), rows)
+        worth = [own[f"misfit_worth_{what}"].abs().median() for what in ("deg", "centre", "focal_rel")]
+        numbers = (*(f"{r:.2f}" for r in ratio), *(f"{w:.2g}" for w in worth))
+        remarked = own["misfit_without_worth"].astype(bool)
+        shares = [(own["severity"] == severity).mean() for severity in Severity]
+        rows.append((name, str(len(own)), *numbers, *(percent(float(share)) for share in (*shares, remarked.mean()))))
+    header = ("true size", "found", "effect / truth 5 %", "median", "95 %", "rotation, degrees", "centre / depth", "f")
+    return table((*header, *(str(severity) for severity in Severity), "accepted with a remark"), rows)
 
 
 def frozen_section(frame: pd.DataFrame) -> str:
@@ -114,11 +118,9 @@ def frozen_section(frame: pd.DataFrame) -> str:
         off = "–" if cameras.empty else f"{cameras['off_sd'].max():.1f}"
         right = f"{int(cameras['implied_right'].sum())} of {len(cameras)}" if len(cameras) else "–"
         rows.append((case, *counts, *steps, named or "–", off, right))
-    header = (
-        *("frozen", "guilty: camera", "others: camera", "misfit", "others: standard", "own_step_px, guilty"),
-        *("largest of others", "named", "worst, sd", "value right"),
-    )
-    return "\n\n".join([words.FROZEN, table(header, rows)])
+    header = ("frozen", "guilty: camera", "others: camera", "misfit", "others: standard", "own_step_px, guilty")
+    last = ("largest of others", "named", "worst, sd", "value right")
+    return "\n\n".join([words.FROZEN, table((*header, *last), rows)])
 
 
 def focal_sd_section(scenes: pd.DataFrame) -> str:

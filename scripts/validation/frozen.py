@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from typing import Final
 
@@ -58,7 +58,6 @@ def _scene_of(case: Frozen, noise: NoiseKind, scene_idx: int, rng: np.random.Gen
         sign = float(rng.choice([-1.0, 1.0]))
         values = (sign * float(rng.uniform(0.0015, 0.0025)), -sign * float(rng.uniform(0.001, 0.002)))
         defects = tuple(DefectSpec(i, DefectKind.TANGENTIAL, values=values) for i in range(NUM_IMAGES))
-    k1_range = SceneSpec().k1_range if case in _OWN_CAMERAS else _K1_RANGES[scene_idx % 2]
     spec = SceneSpec(
         num_images=NUM_IMAGES,
         points_per_image=POINTS_PER_IMAGE,
@@ -66,8 +65,9 @@ def _scene_of(case: Frozen, noise: NoiseKind, scene_idx: int, rng: np.random.Gen
         shared_camera=case not in _OWN_CAMERAS,
         noise=noise_of(noise),
         defects=defects,
-        k1_range=k1_range,
     )
+    if case not in _OWN_CAMERAS:
+        spec = replace(spec, k1_range=_K1_RANGES[scene_idx % 2])
     return simulate_scene(spec, rng)
 
 
@@ -119,7 +119,7 @@ def _with_params(model: SparseModel, case: Frozen, wrong: dict[int, tuple[str, .
         names = model.camera(row).model.param_names
         own = params[int(model.cameras.param_offsets[row]) :][: len(names)]
         _SPOIL[case](own, names, up)
-    return dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
+    return replace(model, cameras=replace(model.cameras, params=params))
 
 
 def _focal(own: FloatArray, names: Sequence[str], up: bool) -> None:

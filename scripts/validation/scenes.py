@@ -18,7 +18,7 @@ from sfm_audit.audit.simulate.adjust import AdjustmentError, adjust_scene, spars
 from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
 from sfm_audit.audit.simulate.noise import NoiseKind
 from sfm_audit.audit.simulate.scene import SceneSpec, SimulatedScene, simulate_scene
-from sfm_audit.audit.table.words import POLICIES, Member, verdict_under
+from sfm_audit.audit.table.words import POLICIES, Member, ReasonCode, verdict_under
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -35,7 +35,7 @@ KEPT = (
     *(f"{test}_p" for test in ("ks", "ks_fitted", "ks_norm", "dap", "sw", "ks_constant", "ks_fitted_constant")),
     *(f"misfit_{group}_{what}" for group in GROUPS for what in ("p", "px")),
     *(f"misfit_{group}_{what}_joint" for group in GROUPS for what in ("px", "q")),
-    *("misfit_group", "misfit_px", "misfit_worth_deg", "misfit_worth_focal_rel", "severity"),
+    *("misfit_group", "misfit_px", "misfit_worth_deg", "misfit_worth_centre", "misfit_worth_focal_rel", "severity"),
     *("advised_camera_model", "pose_offset_px", "own_step_px", "sd_focal_px", "sd_focal_px_conditional"),
     *("verdict_ks", "verdict_misfit", "verdict_camera", "verdict_pose", "plausible", "verdict_noise"),
 )
@@ -122,7 +122,8 @@ def audit_images(design: Design, scene_idx: int, seed: int) -> pd.DataFrame:
     frame.insert(3, "scene", scene_idx)
     frame["num_failed"] = num_failed
     frame["noise_nu0"] = tables.models["noise_nu0"][0].as_py()
-    frame["shared_reason"] = [any(text.startswith("shared_camera") for text in texts) for texts in images["reasons"]]
+    for code in (ReasonCode.SHARED_CAMERA, ReasonCode.MISFIT_WITHOUT_WORTH):
+        frame[str(code)] = [any(text.startswith(code) for text in texts) for texts in images["reasons"]]
     frame = frame.assign(**_joint_columns(auditor), **policy_columns(tables.images))
     frame["effect_alone_px"] = _effect_alone_px(auditor)
     stored = model.cameras.params[model.cameras.param_offsets[model.images.camera_idx]]

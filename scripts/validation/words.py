@@ -102,12 +102,14 @@ up, wrong images freed one after the other (sequential inclusion); `verdict_misf
 instead of 400 per image. *short tracks*: 3 or 4 images."""
 
 CAUSES: Final = """\
-Named causes of the rejected images, a quarter wrong (tangential and principal point count as one answer, and affine as
+Named causes of the images found, a quarter wrong (tangential and principal point count as one answer, and affine as
 an answer to rolling shutter):"""
 
 SEVERITY: Final = """\
-What the rejected images' misfits are worth: the change of the image's rotation and focal length (medians) if the misfit
-were admitted, and the severity that follows. *effect / truth*: of the joint test."""
+What the misfits that were found (effect above tau) are worth: by how much rotation, centre (share of the median depth)
+and focal length (share) of the image would change if the misfit were admitted (medians), and what follows: the
+severity of the rejection, or acceptance with the remark `misfit_without_worth` where that is next to nothing. *effect
+/ truth*: of the joint test; points, poses and focal lengths take up a part of what the image's own refit leaves."""
 
 FROZEN: Final = """\
 ## Parameters that were wrong and never freed
