@@ -9,6 +9,7 @@ from decision_samples import ABSORBED, NOT_TESTED, group, sound, with_misfit
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.misfit import is_worth_nothing
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
 
 ACCEPTED, G, M = Verdict.ACCEPTED, MisfitGroup, Member
@@ -52,6 +53,10 @@ def test_only_a_tested_group_can_be_the_cause():
     odd = replace(NOT_TESTED, q=0.001, gain=99.0)  # no test has a q without being tested; the cause rests on the status
     decision = decide(with_misfit(radial=group(q=0.01, px=0.1), smooth=odd), AuditConfig())
     assert decision.misfit.group is G.RADIAL
+
+
+def test_a_worth_that_nobody_knows_is_enough():
+    assert not any(is_worth_nothing(group, None) for group in G)
 
 
 def test_nothing_tested_has_no_decision_about_misfit():

@@ -302,6 +302,8 @@ def test_a_policy_lists_each_reason_once():
         (Gains(pose=0.95, camera=0.8999, both=1.0), True),
         (Gains(pose=0.95, camera=0.9, both=1.0), False),
         (Gains(pose=0.1, camera=0.95, both=1.0), False),
+        (Gains(pose=9.5, camera=8.99, both=10.0), True),
+        (Gains(pose=9.5, camera=9.01, both=10.0), False),
         (Gains(pose=0.0, camera=-1.0, both=0.0), False),
         (Gains(pose=NAN, camera=NAN, both=NAN), False),
         (None, False),

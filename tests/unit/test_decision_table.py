@@ -147,6 +147,7 @@ TABLE = [
             (M.MISFIT, worth_misfit(g, deg=0.0, focal=0.00299, centre=0.001), {}, REJECTED, [C(f"misfit_{g}")]),
             (M.MISFIT, worth_misfit(g, deg=0.0, focal=0.003, centre=0.00099), {}, REJECTED, [C(f"misfit_{g}")]),
             (M.MISFIT, worth_misfit(g, deg=0.0, focal=-0.003, centre=0.00099), {}, REJECTED, [C(f"misfit_{g}")]),
+            (M.MISFIT, worth_misfit(g, deg=NAN, focal=0.0, centre=0.0), {}, REJECTED, [C(f"misfit_{g}")]),
         )
     ),
     # verdict_camera: parts that do not fit, before all else
