@@ -71,8 +71,9 @@ is drawn per observation from heavy tails it cannot know, and the shape tests sa
 SCENE_MISFIT: Final = "Misfit groups on the same images, image by image as the model stands (`misfit_<group>_p`)."
 
 SCENE_JOINT: Final = """\
-The same in the joint test, where points, poses and the parameters of all other cameras are free too, and the verdicts,
-which rest on it. Conservative below 250 points: what an image says about its own lens is then mostly spent on them."""
+The same in the joint test, where points, poses and the parameters of all cameras are free too, and the verdicts, which
+rest on it. Below 100 points it is liberal: nothing corrects the scores for what the many free parameters took out of
+them, as the leverages do in the test of a single image. The verdict also asks for Holm, Benjamini-Hochberg and tau."""
 
 SHARED_SIZE: Final = "The same where all images share one camera and are tested singly (250 points)."
 
