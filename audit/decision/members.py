@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.diagnostics import CameraDiagnostics, Diagnostics, Worth
 from sfm_audit.audit.decision.misfit import MisfitDecision, is_worth_nothing
-from sfm_audit.audit.table.thresholds import EXACT_SHARE, HALF_PIXEL_SHIFT_PX, KS_CRITICAL
+from sfm_audit.audit.table.thresholds import EXACT_SHARE, HALF_PIXEL_SHIFT_PX, KS_CRITICAL, MAX_WORTHLESS_TAUS
 from sfm_audit.audit.table.words import MISFIT_CODES, Member, MisfitGroup, Reason, ReasonCode, Verdict
 
 
@@ -102,10 +102,10 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
         return undetermined(unknown)
     remarks = _not_tested(found)
     if found.group is not None and found.material:
-        worth = misfit.groups[found.group].worth
-        if worth is not None and is_worth_nothing(found.group, worth):
+        worth, shared = misfit.groups[found.group].worth, misfit.shared
+        small = found.largest_px <= MAX_WORTHLESS_TAUS * found.tau_px and shared is None
+        if small and worth is not None and is_worth_nothing(found.group, worth):
             return Judgement(Verdict.ACCEPTED, (_without_worth(found, worth), *remarks))
-        shared = misfit.shared
         beside = (
             ()
             if shared is None

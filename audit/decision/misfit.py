@@ -36,6 +36,11 @@ class MisfitDecision:
     also: tuple[tuple[MisfitGroup, float], ...]
     untested: tuple[tuple[MisfitGroup, MisfitStatus], ...]
 
+    @property
+    def largest_px(self) -> float:
+        """The largest effect among the material groups, NaN without a cause."""
+        return max((self.px, *(px for _, px in self.also)))
+
 
 def decide_misfit(groups: Mapping[MisfitGroup, GroupDiagnostics], *, alpha: float, tau_px: float) -> MisfitDecision:
     """Name the cause among the material groups, among the significant ones where none is material."""

@@ -51,6 +51,8 @@ HARD_WORTH_FOCAL_REL: Final = 0.01
 WEAK_WORTH_DEG: Final = 0.02
 WEAK_WORTH_FOCAL_REL: Final = 0.001
 """... and one worth less than this in both is weak (method.md section 11)."""
+MAX_WORTHLESS_TAUS: Final = 2.0
+"""A misfit above so many times min_effect rejects, whatever it is worth."""
 MIN_SHIFT_WORTH_CENTRE: Final = 0.001
 MIN_SHIFT_WORTH_FOCAL_REL: Final = 0.003
 """What a principal point or its twin, tangential distortion, has to be worth: share of the median depth, share of f.

@@ -15,6 +15,7 @@ from sfm_audit.audit.decision.diagnostics import Worth
 from sfm_audit.audit.decision.misfit import is_worth_nothing
 from sfm_audit.audit.table.thresholds import (
     ALPHA,
+    MAX_WORTHLESS_TAUS,
     MIN_EFFECT,
     MIN_SHIFT_WORTH_CENTRE,
     MIN_SHIFT_WORTH_FOCAL_REL,
@@ -81,7 +82,8 @@ def as_decided(images: pd.DataFrame) -> pd.Series:
     nothing = [
         isinstance(group, str) and is_worth_nothing(MisfitGroup(group), Worth(*worth)) for group, *worth in worths
     ]
-    return above(TAU_PX)(images) & ~pd.Series(nothing, index=images.index, dtype=bool)
+    small = images.misfit_px.astype(float) <= MAX_WORTHLESS_TAUS * TAU_PX
+    return above(TAU_PX)(images) & ~(small & pd.Series(nothing, index=images.index, dtype=bool))
 
 
 TAU_PX: Final = effect_px(MIN_EFFECT, None) or 0.2

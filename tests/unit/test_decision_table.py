@@ -31,11 +31,13 @@ from decision_samples import (
     parts,
     sound,
     with_misfit,
+    worth,
     worth_misfit,
 )
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.diagnostics import SharedMisfit
 from sfm_audit.audit.table.words import (
     GROUPS,
     POLICIES,
@@ -56,6 +58,12 @@ ASKS_FOR_MEASUREMENTS = (M.MISFIT, M.CAMERA, M.NOISE, M.KS)
 EXCESS = 0.2 - 1.36 / math.sqrt(580)
 FEW = {"num_inliers": 3, "noise": replace(NOISE, num_standardised=3), "misfit": misfit(num_tested=3)}
 NOTHING = sound(num_inliers=0, noise=replace(NOISE, num_standardised=0), misfit=None, camera=None, own=None)
+
+
+def worthless(px, **changes):
+    """A radial misfit of so many px that changes nothing."""
+    return with_misfit(radial=replace(MATERIAL, px=px, worth=worth(deg=0.001, focal=0.0001, centre=0.0)), **changes)
+
 
 # member, diagnostics, settings, verdict, codes
 TABLE = [
@@ -126,6 +134,18 @@ TABLE = [
     (M.MISFIT, with_misfit(**dict.fromkeys(LENS, ABSORBED)), {}, UNDETERMINED, [C.MISFIT_NOT_TESTED]),
     (M.MISFIT, with_misfit(**dict.fromkeys(GROUPS, EXCLUDED)), {}, UNDETERMINED, [C.MISFIT_NOT_TESTED]),
     *((M.MISFIT, with_misfit(**{g: MATERIAL}), {}, REJECTED, [C(f"misfit_{g}")]) for g in GROUPS),
+    # verdict_misfit: above 2 tau, and where the whole camera is at fault, worth does not matter
+    (M.MISFIT, worthless(0.4), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
+    (M.MISFIT, worthless(0.401), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worthless(0.401), {"min_effect": "0.3px"}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
+    (M.MISFIT, worthless(0.3, smooth=group(q=0.01, px=0.401)), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (
+        M.MISFIT,
+        worthless(0.3, shared=SharedMisfit(MisfitGroup.RADIAL, 0.3, "camera 7")),
+        {},
+        REJECTED,
+        [C.SHARED_CAMERA, C.MISFIT_RADIAL],
+    ),
     # verdict_misfit: what it is worth; not known is enough. A shift is not measured by the rotation that takes it up
     *(
         (M.MISFIT, worth_misfit(g, deg=0.0199, focal=0.00099, centre=9.0), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH])
