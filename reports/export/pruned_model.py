@@ -164,9 +164,8 @@ def kept_part(model: SparseModel, pruning: Pruning) -> SparseModel:
     counts = np.bincount(image_idx[rows], minlength=len(images))
     keeps = pruning.keeps_image
     names = tuple(name for name, is_kept in zip(images.name, keeps, strict=True) if is_kept)
-    columns = {
-        field.name: getattr(images, field.name)[keeps] for field in dataclasses.fields(images) if field.name != "name"
-    }
+    stored = {field.name: getattr(images, field.name) for field in dataclasses.fields(images) if field.name != "name"}
+    columns = {name: values[keeps] for name, values in stored.items() if values is not None}
     return dataclasses.replace(
         model,
         images=dataclasses.replace(images, name=names, **columns),
