@@ -263,7 +263,7 @@ def test_a_misfit_without_worth_is_a_remark_beside_what_could_not_be_tested():
 
 
 def test_the_camera_names_the_parameter_that_moves_most_of_its_deviations():
-    steps = (moved(6.0), moved(-9.0, "k1"), moved(8.0, "k2"))
+    steps = (moved(6.0), replace(moved(-9.0, "k1"), step=-0.9, sd=0.1), moved(8.0, "k2"))
     judgement = judged(sound(own=replace(OWN, step_px=0.3, steps=steps)), M.CAMERA)
     assert judgement.reasons[0].text.startswith("k1 = ")
 

@@ -339,6 +339,13 @@ def test_a_policy_is_its_members(policy, wrong, verdict):
         assert verdict_under(other, row) == decision.under(other).verdict
 
 
+@pytest.mark.parametrize("policy", DECIDES)
+@pytest.mark.parametrize("wrong", M)
+def test_a_row_of_a_finished_run_is_counted_by_the_same_members(policy, wrong):
+    row = {**dict.fromkeys(map(str, M), "accepted"), str(wrong): "rejected"}
+    assert verdict_under(policy, row) == (REJECTED if wrong in DECIDES[policy] else ACCEPTED)
+
+
 @pytest.mark.parametrize(
     ("verdicts", "said"),
     [
