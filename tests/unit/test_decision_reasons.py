@@ -257,9 +257,12 @@ def test_a_shared_camera_is_named_beside_a_rejection_and_only_there():
 
 def test_a_misfit_without_worth_is_a_remark_beside_what_could_not_be_tested():
     cheap = replace(MATERIAL, worth=worth(deg=0.0, focal=0.0))
-    judgement = judged(with_misfit(radial=cheap, smooth=NOT_TESTED, shared=SHARED), M.MISFIT)
+    judgement = judged(with_misfit(radial=cheap, smooth=NOT_TESTED), M.MISFIT)
     assert judgement.verdict == ACCEPTED
     assert [reason.code for reason in judgement.reasons] == [C.MISFIT_WITHOUT_WORTH, C.MISFIT_NOT_TESTED]
+    judgement = judged(with_misfit(radial=cheap, shared=SHARED), M.MISFIT)
+    assert judgement.verdict == REJECTED
+    assert [reason.code for reason in judgement.reasons] == [C.SHARED_CAMERA, C.MISFIT_RADIAL]
 
 
 def test_the_camera_names_the_parameter_that_moves_most_of_its_deviations():
