@@ -60,6 +60,10 @@ class _Changed(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
             return None
         return importlib.util.spec_from_loader(fullname, self, origin=self._path)
 
+    def pytest_configure(self) -> None:
+        """Come before pytest's own hook, which rewrites modules that are called like tests (group_test.py)."""
+        sys.meta_path.insert(0, self)
+
     def get_source(self, fullname: str) -> str:
         """Return the changed source."""
         del fullname
@@ -122,15 +126,15 @@ class Runner:
     def _tested(self, mutant: Mutant | None, tests: Sequence[str]) -> int:
         import pytest  # noqa: PLC0415 # imported by the parent already
 
-        if mutant is not None:
-            if mutant.module in sys.modules:
-                for name in [name for name in sys.modules if name.partition(".")[0] == "sfm_audit"]:
-                    del sys.modules[name]
-            sys.meta_path.insert(0, _Changed(mutant, self._root))
+        hooks = [] if mutant is None else [_Changed(mutant, self._root)]
+        sys.meta_path[:0] = hooks
+        if mutant is not None and mutant.module in sys.modules:
+            for name in [name for name in sys.modules if name.partition(".")[0] == "sfm_audit"]:
+                del sys.modules[name]
         os.chdir(self._root)
         arguments = [*(f"tests/{test}" for test in tests), "-x", "-q", "-p", "no:cacheprovider", "--no-header"]
         preloaded = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins that are loaded already
-        return int(pytest.main([*arguments, *preloaded]))
+        return int(pytest.main([*arguments, *preloaded], plugins=hooks))
 
     def _ended(self, pid: int, started: float) -> int | None:
         """Return the exit code of a process, None while it runs; what runs too long is ended and failed."""

@@ -23,7 +23,7 @@ TARGETS: Final = (
     Target(
         "audit/decision/misfit.py",
         DECISION,
-        ("decide_misfit", "is_worth_nothing", "named_cause", "_SHIFTS", "_SAYS_NOTHING"),
+        ("decide_misfit", "is_worth_nothing", "named_cause", "MisfitDecision.largest_px", "_SHIFTS", "_SAYS_NOTHING"),
     ),
     Target("audit/decision/severity.py", DECISION, ("severity_of", "worth_of", "worth_severity", "_ALWAYS_HARD")),
     Target(
@@ -48,7 +48,7 @@ TARGETS: Final = (
             *("MAX_FOCAL_OVER_SIZE", "MAX_SD_FOCAL_REL", "MIN_K1_SDS", "MIN_COVERAGE", "MIN_OCCUPIED_CELLS"),
             *("MAX_NOISE_DISTANCE", "KS_CRITICAL", "MIN_OWN_STEP_SDS", "EXACT_SHARE", "HALF_PIXEL_SHIFT_PX"),
             *("HARD_WORTH_DEG", "HARD_WORTH_FOCAL_REL", "WEAK_WORTH_DEG", "WEAK_WORTH_FOCAL_REL"),
-            *("MIN_SHIFT_WORTH_CENTRE", "MIN_SHIFT_WORTH_FOCAL_REL", "effect_px"),
+            *("MIN_SHIFT_WORTH_CENTRE", "MIN_SHIFT_WORTH_FOCAL_REL", "MAX_WORTHLESS_TAUS", "effect_px"),
         ),
     ),
     Target(

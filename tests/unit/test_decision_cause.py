@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from decision_samples import ABSORBED, NOT_TESTED, group, sound, with_misfit
+from decision_samples import ABSORBED, CAMERA, NOT_TESTED, group, sound, with_misfit
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.decide import decide
@@ -57,6 +57,10 @@ def test_only_a_tested_group_can_be_the_cause():
 
 def test_a_worth_that_nobody_knows_is_enough():
     assert not any(is_worth_nothing(group, None) for group in G)
+
+
+def test_a_camera_without_principal_point_has_none_outside():
+    assert replace(CAMERA, principal_point_px=None).principal_point_outside is False
 
 
 def test_nothing_tested_has_no_decision_about_misfit():

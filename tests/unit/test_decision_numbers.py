@@ -113,6 +113,8 @@ def test_own_numbers_are_those_on_which_both_weights_agree():
     assert [step.step for step in against.steps] == [0.0, 0.0]
     smaller = jointly.own_diagnostics(camera_step(step=(-10.0, 0.1), plain=(-7.0, 0.05)), 0.5)
     assert [step.step for step in smaller.steps] == [-7.0, 0.05]
+    smaller = jointly.own_diagnostics(camera_step(step=(-7.0, 0.05), plain=(-10.0, 0.1)), 0.5)
+    assert [step.step for step in smaller.steps] == [-7.0, 0.05]
 
 
 def test_a_joint_test_keeps_its_numbers():

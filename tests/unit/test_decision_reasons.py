@@ -260,6 +260,9 @@ def test_a_misfit_without_worth_is_a_remark_beside_what_could_not_be_tested():
     judgement = judged(with_misfit(radial=cheap, smooth=NOT_TESTED), M.MISFIT)
     assert judgement.verdict == ACCEPTED
     assert [reason.code for reason in judgement.reasons] == [C.MISFIT_WITHOUT_WORTH, C.MISFIT_NOT_TESTED]
+    judgement = judged(with_misfit(radial=cheap, shared=SHARED), M.MISFIT)
+    assert judgement.verdict == REJECTED
+    assert [reason.code for reason in judgement.reasons] == [C.SHARED_CAMERA, C.MISFIT_RADIAL]
 
 
 def test_a_misfit_of_a_shared_camera_rejects_whatever_it_is_worth_to_one_image():
@@ -270,7 +273,7 @@ def test_a_misfit_of_a_shared_camera_rejects_whatever_it_is_worth_to_one_image()
 
 
 def test_the_camera_names_the_parameter_that_moves_most_of_its_deviations():
-    steps = (moved(6.0), moved(-9.0, "k1"), moved(8.0, "k2"))
+    steps = (moved(6.0), replace(moved(-9.0, "k1"), step=-0.9, sd=0.1), moved(8.0, "k2"))
     judgement = judged(sound(own=replace(OWN, step_px=0.3, steps=steps)), M.CAMERA)
     assert judgement.reasons[0].text.startswith("k1 = ")
 

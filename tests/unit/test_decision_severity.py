@@ -92,4 +92,5 @@ def test_the_worth_is_that_of_the_named_cause():
 
 
 def test_hard_is_listed_first():
-    assert sorted(Severity, key=SEVERITY_ORDER.__getitem__) == [HARD, MEDIUM, WEAK]
+    assert sorted([WEAK, MEDIUM, HARD], key=SEVERITY_ORDER.__getitem__) == [HARD, MEDIUM, WEAK]
+    assert set(SEVERITY_ORDER) == set(Severity)

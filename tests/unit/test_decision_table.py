@@ -159,6 +159,7 @@ TABLE = [
     (M.MISFIT, worth_misfit(deg=0.0199, focal=NAN), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
     (M.MISFIT, worth_misfit(deg=0.02, focal=NAN), {}, REJECTED, [C.MISFIT_RADIAL]),
     (M.MISFIT, worth_misfit(deg=NAN, focal=0.0, centre=0.0), {}, REJECTED, [C.MISFIT_RADIAL]),
+    (M.MISFIT, worthless(0.3, smooth=group(q=0.01, px=0.4)), {}, ACCEPTED, [C.MISFIT_WITHOUT_WORTH]),
     *(
         row
         for g in SHIFTS
@@ -253,6 +254,10 @@ TABLE = [
     (M.PLAUSIBLE, camera(sd_focal_rel=NAN, singular_share=NAN), {}, UNDETERMINED, [C.NON_FINITE_DERIVATIVES]),
     (M.PLAUSIBLE, camera(k1=0.002), {}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(k1=-0.0019), {}, ACCEPTED, [C.K1_NOT_IDENTIFIED]),
+    (M.PLAUSIBLE, replace(camera(k1=-0.0019), own=own().own), {}, ACCEPTED, []),  # frozen where it is: wrong, needed
+    (M.PLAUSIBLE, replace(camera(k1=-0.0019), own=None), {}, ACCEPTED, [C.K1_NOT_IDENTIFIED]),
+    (M.PLAUSIBLE, replace(camera(k1=-0.0019), consistency=None), {}, ACCEPTED, [C.K1_NOT_IDENTIFIED]),
+    (M.PLAUSIBLE, replace(camera(coverage=0.0), own=own().own), {}, UNDETERMINED, [C.LOW_COVERAGE]),
     (M.PLAUSIBLE, camera(k1=-0.0019), {"min_k1_sds": 1.8}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(sd_k1=NAN), {}, ACCEPTED, [C.K1_NOT_IDENTIFIED]),
     (M.PLAUSIBLE, camera(k1=None, sd_k1=NAN), {}, ACCEPTED, []),
@@ -337,6 +342,13 @@ def test_a_policy_is_its_members(policy, wrong, verdict):
         assert decision.under(other).verdict == (verdict if wrong in members else ACCEPTED)
         row = {member: decision.of(member) for member in M}
         assert verdict_under(other, row) == decision.under(other).verdict
+
+
+@pytest.mark.parametrize("policy", DECIDES)
+@pytest.mark.parametrize("wrong", M)
+def test_a_row_of_a_finished_run_is_counted_by_the_same_members(policy, wrong):
+    row = {**dict.fromkeys(map(str, M), "accepted"), str(wrong): "rejected"}
+    assert verdict_under(policy, row) == (REJECTED if wrong in DECIDES[policy] else ACCEPTED)
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ LIMITS = [
     {"min_focal_over_size": 0.63},
     {"max_focal_over_size": 0.6},
     {"max_sd_focal_rel": 1e-4},
-    {"min_k1_sds": 20.0},
+    {"min_k1_sds": 1e4},
     {"min_coverage": 0.7},
     {"min_occupied_cells": 45},
 ]
