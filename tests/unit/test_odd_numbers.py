@@ -103,4 +103,4 @@ def test_what_can_be_calculated_with(model):
 
 
 def test_a_pose_that_moves_no_point_has_no_offset():
-    assert math.isnan(pose_offset_px(np.ones((2, 30)), np.zeros((2, 3, 30)), np.ones((3, 30))))
+    assert math.isnan(pose_offset_px(np.ones((2, 30)), np.zeros((2, 3, 30)), np.ones((30, 3))))
