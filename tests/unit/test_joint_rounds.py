@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -286,3 +287,12 @@ def test_fields_that_are_nowhere_or_not_finite_have_no_root():
         | {"sq_length": np.array([80.0, 0.0]), "gram": np.diag([80.0, 0.0])}
     )
     assert group_root(nowhere, slice(0, 2)) == pytest.approx(np.array([[1 / math.sqrt(80.0), 0.0]]))
+
+
+def test_the_root_whitens_the_fields_of_an_image_in_their_own_units():
+    rng = np.random.default_rng(4)
+    factor = rng.standard_normal((8, 3)) * np.array([1e-3, 1.0, 1e3])
+    gram = factor.T @ factor
+    wide = replace(scores(), gram=gram, sq_length=np.diag(gram) * np.array([1.0, 1.5, 2.0]))
+    root = group_root(wide, slice(0, 3))
+    np.testing.assert_allclose(root @ gram @ root.T, np.eye(3), atol=1e-9)
