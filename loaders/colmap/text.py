@@ -56,7 +56,8 @@ def read_model(folder: InputPath) -> RawModel:
     cameras = read_cameras(camera_file)
     image_file = read_text(folder / "images.txt")
     images = read_images(image_file)
-    point_file = read_text(folder / "points3D.txt")
+    # COLMAP's FAQ makes known poses a model with an empty points3D.txt; check_count refuses it where points are missing
+    point_file = read_text(folder / "points3D.txt", may_be_empty=True)
     points = read_points(point_file)
     rigs, rig_findings = read_rigs(folder / "rigs.txt") if exists(folder / "rigs.txt") else (None, ())
     frames, frame_findings = read_frames(folder / "frames.txt") if exists(folder / "frames.txt") else (None, ())
@@ -86,7 +87,7 @@ def check_structure(folder: InputPath) -> None:
     """Raise LoadError where a file of the model holds a NUL byte, as one that was grown by zeros does."""
     for name in ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"):
         if exists(folder / name):
-            check_text(folder / name)
+            check_text(folder / name, may_be_empty=name == "points3D.txt")
 
 
 def read_cameras(file: TextFile) -> CameraTable:

@@ -64,7 +64,7 @@ def _remote(path: RemotePath) -> InputFile:
 
 
 def _hashed(path: InputPath) -> InputFile:
-    file, _ = open_input(path)
+    file, _ = open_input(path, may_be_empty=True)  # the reader says whether it may
     with file, reading(path):
         digest = hashlib.file_digest(file, "sha256")
         return InputFile(path.name, file.tell(), digest.hexdigest())

@@ -69,8 +69,8 @@ def is_folder(path: InputPath) -> bool:
     return kind_of(path) == "folder"
 
 
-def open_input(path: InputPath, *, only_head: bool = False) -> tuple[BufferedReader, int]:
-    """Open a regular, non-empty file that is no Git LFS pointer.
+def open_input(path: InputPath, *, only_head: bool = False, may_be_empty: bool = False) -> tuple[BufferedReader, int]:
+    """Open a regular file that is no Git LFS pointer, and not empty unless it ``may_be_empty``.
 
     A file of an object store is read in large pieces while the caller reads, in small ones for a caller that wants
     ``only_head``; nothing is stored on this machine.
@@ -85,12 +85,12 @@ def open_input(path: InputPath, *, only_head: bool = False) -> tuple[BufferedRea
     MissingFileError, UnreadableFileError, LfsPointerError
         Where the file does not exist, cannot be read, or holds a pointer instead of data.
     TruncatedFileError
-        Where the file holds no byte at all.
+        Where the file holds no byte at all and must hold some.
     """
     file, size = _open_remote(path, only_head=only_head) if isinstance(path, RemotePath) else _open_local(path)
     try:
         with reading(path):
-            _check_content(path, file, size)
+            _check_content(path, file, size, may_be_empty=may_be_empty)
     except LoadError:
         file.close()
         raise
@@ -179,13 +179,13 @@ def _kind_of(mode: int) -> str:
     return kinds.get(stat.S_IFMT(mode), "neither a file nor a folder")
 
 
-def _check_content(path: InputPath, file: BufferedReader, size: int) -> None:
-    """Raise LoadError where the file holds no byte, or a Git LFS pointer."""
+def _check_content(path: InputPath, file: BufferedReader, size: int, *, may_be_empty: bool) -> None:
+    """Raise LoadError where the file holds a Git LFS pointer, or no byte and must hold some."""
     head = file.peek(len(LFS_PREFIX))[: len(LFS_PREFIX)]  # reading and going back would ask a store twice
     if head == LFS_PREFIX:
         advice = "fetch the data with `git lfs pull`"
         raise LfsPointerError(str(path), None, "a reconstruction's data", "a Git LFS pointer", advice)
-    if size == 0:
+    if size == 0 and not may_be_empty:
         raise TruncatedFileError(str(path), None, "a reconstruction's data", "an empty file", _COPY_AGAIN)
 
 

@@ -52,11 +52,11 @@ class TextFile:
         return TruncatedFileError(str(self.path), Position("line", len(self.lines)), wanted, got, _RECOPY)
 
 
-def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
+def read_text(path: InputPath, advice: str = _ADVICE, *, may_be_empty: bool = False) -> TextFile:
     """Read a text file; errors as of `loaders.paths.files.open_input`, and MalformedFileError where it is no text."""
     lines: list[bytes] = []
     begun: list[bytes] = []  # pieces of a line that goes on
-    for piece in _pieces(path, advice):
+    for piece in _pieces(path, advice, may_be_empty=may_be_empty):
         first, *more = piece.split(b"\n")
         begun.append(first)
         if more:
@@ -73,15 +73,15 @@ def read_text(path: InputPath, advice: str = _ADVICE) -> TextFile:
     return TextFile(path, lines, int(stated[1]) if stated else None, is_terminated, advice)
 
 
-def check_text(path: InputPath, advice: str = _ADVICE) -> None:
+def check_text(path: InputPath, advice: str = _ADVICE, *, may_be_empty: bool = False) -> None:
     """Raise MalformedFileError where a file holds a NUL byte; nothing behind the first one is read."""
-    for _ in _pieces(path, advice):
+    for _ in _pieces(path, advice, may_be_empty=may_be_empty):
         pass
 
 
-def _pieces(path: InputPath, advice: str) -> Iterator[bytes]:
+def _pieces(path: InputPath, advice: str, *, may_be_empty: bool) -> Iterator[bytes]:
     """Yield a file in pieces; raises at the first NUL byte."""
-    file, _ = open_input(path)
+    file, _ = open_input(path, may_be_empty=may_be_empty)
     line = 1
     with file, reading(path):
         while piece := file.read(_PIECE_BYTES):

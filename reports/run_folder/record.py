@@ -30,7 +30,7 @@ _Setting = str | bool | int | float | None
 class _Record(BaseModel):
     """Unknown names are passed over: a later version may say more."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False, protected_namespaces=())
 
 
 class PathRecord(_Record):

@@ -288,7 +288,6 @@ def test_a_list_is_refused_where_a_name_is_kept_and_removed(audited, tmp_path, c
     assert re.search(r"2 images called 0002\.jpg in .*, 1 of them kept and 1 not", err)
 
 
-@pytest.mark.xfail(reason="an empty points3D.txt is refused as cut short")
 def test_known_poses_without_points_are_an_empty_model(audited):
     said = audited("c27_empty_points_file")
     assert (said.code, said.err) == (0, "")

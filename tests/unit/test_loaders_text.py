@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from model_writer import UNLINKED, Camera, Image, Point, rig_model, text_files, tiny_model, write_text
 from numpy.testing import assert_array_equal
@@ -223,6 +224,27 @@ def test_a_file_of_comments_is_no_model(tmp_path: Path, name: str):
 def test_the_points2d_line_may_be_empty_but_not_missing(folder: Path):
     rewrite(folder, "images.txt", lambda text: text.removesuffix(b"\n"))
     with pytest.raises(TruncatedFileError, match="a line of POINTS2D"):
+        open_model(folder)
+
+
+def test_known_poses_may_have_an_empty_points_file(tmp_path: Path):
+    """As COLMAP's FAQ makes them, and pycolmap reads them."""
+    write_text(
+        tmp_path,
+        tiny_model().but(cameras=(Camera(1),), images=(Image(1, "a.jpg"), Image(2, "b.jpg")), points=()),
+        header=False,
+    )
+    (tmp_path / "points3D.txt").write_bytes(b"")
+    model = open_model(tmp_path)
+    assert len(model.images) == pycolmap.Reconstruction(str(tmp_path)).num_images() == 2
+    assert len(model.points) == 0
+    assert [finding.code for finding in model.findings] == [FindingCode.EMPTY_MODEL]
+
+
+@pytest.mark.parametrize("name", text_files(tiny_model()))
+def test_an_empty_file_that_something_is_missing_from_is_refused(folder: Path, name: str):
+    (folder / name).write_bytes(b"")
+    with pytest.raises(TruncatedFileError):
         open_model(folder)
 
 
