@@ -96,8 +96,12 @@ def judge_misfit(diagnostics: Diagnostics, found: MisfitDecision | None, setting
     if misfit is None or found is None:
         few = too_few(member, "inliers", diagnostics.num_inliers, settings)
         return undetermined(*([few] if few else []))
-    what = "inliers" if misfit.num_tested == diagnostics.num_inliers else f"clean of {diagnostics.num_inliers} inliers"
-    unknown = exact_projections(member, diagnostics) or too_few(member, what, misfit.num_tested, settings)
+    num = diagnostics.num_inliers
+    unknown = (
+        exact_projections(member, diagnostics)
+        or too_few(member, "inliers", num, settings)
+        or too_few(member, f"of {num} inliers tested", misfit.num_tested, settings)
+    )
     if unknown is not None:
         return undetermined(unknown)
     remarks = _not_tested(found)

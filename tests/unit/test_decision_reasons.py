@@ -65,7 +65,7 @@ def judged(diagnostics, member, **settings):
             M.NOISE,
             "pixel_convention: D - 1.36 / sqrt(N) = 0.144 > 0.03, N = 580",
         ),
-        (with_misfit(num_tested=3), M.MISFIT, "too_few_observations: 3 clean of 300 inliers, 20 needed"),
+        (with_misfit(num_tested=3), M.MISFIT, "too_few_observations: 3 of 300 inliers tested, 20 needed"),
         (sound(misfit=misfit(num_tested=3), num_inliers=3), M.MISFIT, "too_few_observations: 3 inliers, 20 needed"),
         (sound(misfit=None, num_inliers=7), M.MISFIT, "too_few_observations: 7 inliers, 20 needed"),
         (

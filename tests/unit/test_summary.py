@@ -166,7 +166,7 @@ def test_which_codes_can_be_remarks(code, verdict):
 
 
 def test_an_image_counts_once_per_reason(run_folder):
-    reasons = [["too_few_observations: 9 inliers", "too_few_observations: 3 clean of 9 inliers"]]
+    reasons = [["too_few_observations: 9 inliers", "too_few_observations: 3 of 9 inliers tested"]]
     text = one_model(run_folder, ("undetermined",), reasons=reasons)
     assert "too_few_observations  1 image, IMG_0000.jpg: 9 inliers" in text
 
