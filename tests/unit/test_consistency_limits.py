@@ -47,6 +47,7 @@ MODELS = {
         [image(Cause.SHIFT)] * 3 + [image()] * 3 + [image(known=False)] * 9,
         [(PARTS, 3, Cause.SHIFT)],
     ),
+    "an image alone": ([image(Cause.SHIFT)], [(PARTS, 1, Cause.SHIFT)]),
     "two causes": (
         [image(Cause.SHIFT), image(Cause.LINKS), image(Cause.SHIFT)] + [image()] * 9,
         [(SOME, 2, Cause.SHIFT), (SOME, 1, Cause.LINKS)],
@@ -166,6 +167,15 @@ def test_half_a_pixel_has_to_be_known_to_five_sd_and_not_to_be_zero():
     assert consistency(xyz, exact + 0.5 + 1e-3).half_pixel == 1
     stretched = (exact - exact.mean(axis=0)) * 1.002 + exact.mean(axis=0)
     assert consistency(xyz, stretched + 0.5).half_pixel == 0
+
+
+def test_a_sphere_has_no_half_pixel():
+    """It has no affine fit either; the table's column is made of this number, None would be null there."""
+    xyz, _ = scene(0)
+    sphere = CameraRecord(1, BY_NAME["EQUIRECTANGULAR"], 2000, 1000, np.array([2000.0, 1000.0]))
+    found = consistency(xyz, project(sphere.model, sphere.params, xyz) + 0.5, camera=sphere)
+    assert found.affine is None
+    assert found.half_pixel == 0
 
 
 def test_a_large_rest_is_no_resolution():
