@@ -6,9 +6,10 @@ in pixels of the distorted image, centre of the first pixel at (0.5, 0.5). Ids a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -289,6 +290,27 @@ class SparseModel:
             if len(rows):
                 return int(rows[0])
         raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedPairs:
+    """Verified matches of some pairs of images.
+
+    image_idx: (k, 2) rows of ImageTable, the first smaller.    offsets: (k + 1,), pair i owns matches
+    offsets[i]:offsets[i + 1].    xy_px: (2, m, 2) of both images, px, as observed.
+    """
+
+    image_idx: IntArray
+    offsets: IntArray
+    xy_px: FloatArray
+
+
+class PairSource(Protocol):
+    """Where verified matches come from, some pairs at a time: there may be more of them than memory holds."""
+
+    def batches(self) -> Iterator[MatchedPairs]:
+        """Go through all pairs whose two images the model has."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

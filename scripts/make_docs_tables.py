@@ -86,7 +86,8 @@ cells; fewer than {min_observations} inliers |
 {max_noise_distance} | fewer than {min_observations} standardised observations; no noise fitted |
 | `verdict_ks` | Are the residuals the noise that the noise model says? (the paper's decision) | `ks_p` < {alpha} \
 (with `min_ks_distance`: and D above it) | fewer than {min_observations} standardised observations; no noise fitted |
-| `verdict_outside` | Do witnesses outside of the image agree? | a witness disagrees | null where none was asked |
+| `verdict_outside` | Do witnesses outside of the image agree (docs/witnesses.md)? | a witness disagrees that is \
+known to be rarely wrong | another witness disagrees; null where no witness could say anything |
 
 The numbers are defaults (docs/config.md). q: Holm over the groups of an image, then Benjamini-Hochberg over the images
 of its model; nothing depends on other models. *Joint test*: shared points carry the field of a wrong image into its

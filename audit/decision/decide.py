@@ -17,6 +17,7 @@ from sfm_audit.audit.decision.members import (
     judge_pose,
 )
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
+from sfm_audit.audit.decision.outside import judge_outside
 from sfm_audit.audit.decision.severity import severity_of
 from sfm_audit.audit.table.words import POLICIES, Member, PolicyName, Reason, ReasonCode, Severity, Verdict, strongest
 
@@ -86,7 +87,7 @@ def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
             m: Judgement(Verdict.UNDETERMINED, (replace(blocked, member=m),)) for m in asked
         }
     else:
-        camera = judge_camera(diagnostics, settings)
+        camera, outside = judge_camera(diagnostics, settings), judge_outside(diagnostics, settings)
         members = {
             Member.MISFIT: judge_misfit(diagnostics, found, settings),
             **({} if camera is None else {Member.CAMERA: camera}),
@@ -94,6 +95,7 @@ def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
             Member.PLAUSIBLE: _without_k1_remark(judge_plausible(diagnostics, settings), camera),
             Member.NOISE: judge_noise(diagnostics, settings),
             Member.KS: judge_ks(diagnostics, settings),
+            **({} if outside is None else {Member.OUTSIDE: outside}),
         }
     pose_first = pose_alone(diagnostics.gains)
     judgement = judgement_under(members, settings.policy, pose_first=pose_first)

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sfm_audit.audit.misfit import MisfitTests, bic
+from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import GROUPS, LENS_GROUPS, MisfitGroup, MisfitStatus, Reason
 from sfm_audit.loaders.arrays import FloatArray
 
@@ -204,6 +205,7 @@ class Diagnostics:
     misfit, camera: None without inliers.    remarks: reasons that decide nothing, found elsewhere.
     consistency, own, gains: None where nobody asked; has_own: whether the camera has own parameters to ask for.
     half_pixel: its 2D points, and those of most images, are shifted by half a pixel (finding pixel_convention).
+    testimonies: what witnesses outside of the image say of it; None where no witness was asked.
     """
 
     num_inliers: int
@@ -220,3 +222,4 @@ class Diagnostics:
     has_own: bool = False
     gains: Gains | None = None
     half_pixel: bool = False
+    testimonies: tuple[WitnessStatement, ...] | None = None

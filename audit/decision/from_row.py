@@ -22,6 +22,7 @@ from sfm_audit.audit.decision.diagnostics import (
 )
 from sfm_audit.audit.table.columns import own_parameter_names
 from sfm_audit.audit.table.thresholds import SINGULAR_SHARE
+from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
 from sfm_audit.audit.table.words import GROUPS, UNUSABLE, Member, MisfitGroup, MisfitStatus, Reason, ReasonCode
 from sfm_audit.loaders.camera_models import BY_NAME, CameraModel
 
@@ -34,7 +35,7 @@ READ_COLUMNS: Final = (
     *("num_misfit_tested", "misfit_details", "own_step_px", "own_num_images", "own_sigma_px", "own_implied"),
     *(f"own_{name}_{number}" for name in own_parameter_names() for number in ("step", "sd")),
     *("gain_pose", "gain_camera", "gain_both", "sd_focal_rel", "sd_k1", "singular_share", "half_pixel"),
-    *(str(Member.CAMERA), "reason_details"),
+    *(str(Member.CAMERA), "reason_details", "testimonies"),
 )
 """All that `diagnostics_of_row` looks at."""
 
@@ -72,6 +73,24 @@ def diagnostics_of_row(row: Row) -> Diagnostics:
         has_own=row["folds_over"] is not None and bool(_own_names(BY_NAME[row["camera_model"]])),
         gains=_gains(row, own),
         half_pixel=row["half_pixel"],
+        testimonies=_testimonies(row),
+    )
+
+
+def _testimonies(row: Row) -> tuple[WitnessStatement, ...] | None:
+    """What the witnesses said of the image; None where none was asked."""
+    if row["testimonies"] is None:
+        return None
+    return tuple(
+        WitnessStatement(
+            Witness(item["witness"]),
+            number_of(item["score"]),
+            number_of(item["limit"]),
+            item["text"],
+            number_of(item["q"]),
+            item["unit"],
+        )
+        for item in row["testimonies"]
     )
 
 

@@ -114,8 +114,6 @@ def _check_columns(images: pa.Table) -> None:
     missing = sorted((_READ | set(_WRITTEN)) - set(images.column_names))
     if missing:
         raise MissingColumnError(missing)
-    if images.column(str(Member.OUTSIDE)).null_count < images.num_rows:
-        raise RedecisionError(f"{Member.OUTSIDE} was asked in this run and cannot be decided again: run again")
 
 
 def _check_settings(settings: AuditConfig, run: AuditConfig) -> None:

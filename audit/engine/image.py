@@ -30,6 +30,7 @@ from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
 from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
 from sfm_audit.audit.normality import NormalityTests, normality_tests
+from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import ImageRecord, InlierSet
@@ -48,6 +49,7 @@ class ImageEvidence:
     consistency, own, has_own, gains, half_pixel: see `Diagnostics`.
     expected_error_px: with the joint covariance, NaN unknown.
     implied: changes that parameters which nobody freed would take, by column.
+    testimonies, outside: what witnesses outside of the image say of it, and what they measured, by column.
     """
 
     inliers: InlierSet
@@ -67,6 +69,8 @@ class ImageEvidence:
     half_pixel: bool = False
     expected_error_px: float = math.nan
     implied: Mapping[str, float] = field(default_factory=dict)
+    testimonies: tuple[WitnessStatement, ...] | None = None
+    outside: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +81,7 @@ class ImageAudit:
     noise, tests: under the chosen noise model.          constant, constant_tests: one scale for all raw residuals.
     quality: of the camera, as the model stands; None without inliers.
     diagnostics, decision: the numbers that decide, and what was decided.
-    expected_error_px, implied: see `ImageEvidence`.
+    expected_error_px, implied, outside: see `ImageEvidence`.
     advised_camera_model: see `audit.misfit.advised_camera_model`.
     """
 
@@ -94,6 +98,7 @@ class ImageAudit:
     advised_camera_model: str | None
     expected_error_px: float = math.nan
     implied: Mapping[str, float] = field(default_factory=dict)
+    outside: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def image(self) -> ImageRecord:
@@ -196,6 +201,7 @@ def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
         advised_camera_model=advice,
         expected_error_px=evidence.expected_error_px,
         implied=evidence.implied,
+        outside=evidence.outside,
     )
 
 
@@ -216,6 +222,7 @@ def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
         has_own=evidence.has_own,
         gains=evidence.gains,
         half_pixel=evidence.half_pixel,
+        testimonies=evidence.testimonies,
     )
 
 

@@ -43,8 +43,10 @@ from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypo
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.words import MisfitStatus
+from sfm_audit.audit.witnesses.asking import Outside, ask
+from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
+from sfm_audit.loaders.model import CameraRecord, InlierSet, PairSource, SparseModel
 
 T = TypeVar("T")
 
@@ -72,6 +74,7 @@ class ModelAuditor:
     keypoint_scale_px : (M,) size of the keypoint of each row of ``model.observations``, NaN where unknown; needed by
         the noise model ``keypoint`` alone (`loaders.colmap.database`)
     spread : where the stages run that look at one image at a time; the numbers do not depend on it
+    pairs : verified matches of the database that the model was made from (`loaders.colmap.pairs`); None without
     """
 
     def __init__(
@@ -81,8 +84,10 @@ class ModelAuditor:
         keypoint_scale_px: FloatArray | None = None,
         *,
         spread: Spread = in_turn,
+        pairs: PairSource | None = None,
     ) -> None:
         self.model = model
+        self._pairs = pairs
         self._spread = spread
         self.config = config or AuditConfig()
         self._keypoint_scale_px = keypoint_scale_px
@@ -91,7 +96,7 @@ class ModelAuditor:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out where images are audited: an unpickled auditor runs serially."""
-        return {**self.__dict__, "_spread": in_turn}
+        return {**self.__dict__, "_spread": in_turn, "_pairs": None}
 
     @cached_property
     def residuals(self) -> ModelResiduals:
@@ -171,6 +176,11 @@ class ModelAuditor:
             image_from_frame=None if frames is None else frames.image_from_frame,
             points_independent=self.config.points == "independent",
         )
+
+    @cached_property
+    def outside(self) -> Outside:
+        """What witnesses outside of the images say."""
+        return ask(Evidence(self.model, self.residuals, self.sigma_constant_px, self._pairs))
 
     @cached_property
     def steps(self) -> dict[int, CameraStep]:
@@ -256,6 +266,8 @@ class ModelAuditor:
                 self.consistency.images[image_idx], all_behind=self.consistency.points_behind
             ),
             half_pixel=self.consistency.half_pixel and bool(self.consistency.images[image_idx].half_pixel),
+            testimonies=self.outside.testimonies(image_idx),
+            outside=self.outside.columns(image_idx),
             **self._of_camera(image_idx),
         )
         return audit_image(evidence, self.config)
@@ -322,13 +334,14 @@ class ModelAuditor:
     def tables(self, labels: ModelLabels | None = None, *, observations: bool = False) -> ModelAudit:
         """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
         labels = labels or self._own_labels
-        _ = self.joint, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks  # shared
+        shared = self.joint, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks
+        _ = shared, self.outside  # before the images are spread
         images = self._spread(partial(_images_of, labels=labels), self)
         rows = [row for row, _ in images]
         decisions = [decision for _, decision in images]
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
-        findings = [*self.model.findings, *pose_findings(self.model), *own_findings]
+        findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
         return ModelAudit(
             images_table(rows),
@@ -346,6 +359,7 @@ def audit_model(
     *,
     observations: bool = False,
     spread: Spread = in_turn,
+    pairs: PairSource | None = None,
 ) -> ModelAudit:
     """Audit all images of a model.
 
@@ -356,7 +370,7 @@ def audit_model(
     labels : the text columns that name the model in a dataset
     keypoint_scale_px : see `ModelAuditor`
     observations : whether to make the table of observations too, one row per inlier
-    spread : see `ModelAuditor`
+    spread, pairs : see `ModelAuditor`
 
     Returns
     -------
@@ -366,7 +380,7 @@ def audit_model(
     # Matrices are small here: a second BLAS thread only waits for the first, and on a busy machine that costs 10 x.
     # Odd numbers end as NaN and undetermined; what numpy says about them on the way is nothing for the terminal.
     with threadpool_limits(limits=1, user_api="blas"), np.errstate(all="ignore"):
-        auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread)
+        auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread, pairs=pairs)
         return auditor.tables(labels, observations=observations)
 
 

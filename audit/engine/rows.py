@@ -22,7 +22,7 @@ from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.audit.table.columns import IMPLIED, own_parameter_names
+from sfm_audit.audit.table.columns import IMPLIED, OUTSIDE_COLUMNS, own_parameter_names
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
@@ -69,7 +69,18 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         **own_columns(audit.diagnostics.own),
         **_deciding_columns(audit.diagnostics),
         **{name: audit.implied.get(name, math.nan) for name in IMPLIED},
+        **_outside_columns(audit),
         **verdict_columns(audit.decision),
+    }
+
+
+def _outside_columns(audit: ImageAudit) -> Row:
+    """What witnesses outside of the image measured, and what they said of it."""
+    said = audit.diagnostics.testimonies
+    return {
+        **{name: audit.outside.get(name, null) for name, null in OUTSIDE_COLUMNS.items()},
+        "witnesses": None if said is None else [str(each.witness) for each in said],
+        "testimonies": None if said is None else list(said),
     }
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -16,6 +17,7 @@ from sfm_audit.audit.table.kinds import (
     CODED_TEXT,
     MISFIT_DETAIL,
     REASON_DETAIL,
+    TESTIMONY,
     Column,
     count,
     flag,
@@ -114,6 +116,15 @@ IMPLIED: Final = {
 }
 """Columns of parameters that nobody freed (method.md section 11)."""
 
+_OUTSIDE: Final = (
+    count("num_pairs_strong", "verified pairs with covisible images, of at least 60 matches; null without a database"),
+    count("num_pairs_contradicting", "of these, pairs that the two cameras contradict in most of their matches"),
+    number("pairs_p", "p-value of so many contradicting pairs under the rate of the model's other pairs"),
+    number("pairs_q", "Benjamini-Hochberg q-value of pairs_p over the model's images"),
+)
+OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.unit != "count" else None for column in _OUTSIDE}
+"""What witnesses outside of the image measure, and what stands there where they measured nothing."""
+
 IMAGES: Final[tuple[Column, ...]] = (
     *_IDENTITY,
     stored_id("image_id", "id as stored"),
@@ -192,6 +203,9 @@ IMAGES: Final[tuple[Column, ...]] = (
     flag("folds_over", "whether the distortion folds inside the image"),
     px("expected_error_px", "expected error of a measurement with this camera and pose, median over a 16 x 16 grid"),
     px("expected_error_px_conditional", "the same, conditional on the points: a lower bound"),
+    *_OUTSIDE,
+    texts("witnesses", "witnesses outside of the image that said something of it; null where none was asked"),
+    Column("testimonies", list_of(TESTIMONY), "text", "what they said; null where none was asked"),
     text("verdict", "accepted, rejected or undetermined under the policy of the run"),
     text("verdict_ks", "rejected when ks_p < alpha; undetermined with too few standardised observations"),
     text("verdict_misfit", "rejected when a group has q < alpha and an effect above min_effect in the joint test"),
@@ -199,7 +213,7 @@ IMAGES: Final[tuple[Column, ...]] = (
     text("plausible", "rejected when this cannot be a camera, undetermined when the image says too little of it"),
     text("verdict_camera", "rejected when its own parameters are not at their optimum, or parts do not fit together"),
     text("verdict_noise", "rejected when the noise is visibly another one: ks_stat - 1.36 / sqrt(N) above 0.03"),
-    text("verdict_outside", "rejected when witnesses outside of the image disagree; null where none was asked"),
+    text("verdict_outside", "what witnesses outside of the image make of it; null where none could say anything"),
     text("severity", "of a rejection: hard, medium or weak; null where no member rejects"),
     texts("reasons", "why not accepted, and remarks: code, colon, and the number that triggered it"),
     Column("reason_details", list_of(REASON_DETAIL), "text", "reasons of all verdicts, the policy's or not"),

@@ -108,4 +108,16 @@ MISFIT_DETAIL: Final = pa.struct(
 )
 """One group in the joint test: why it has a q, or why not, BIC gain, and what admitting it would do to the image."""
 
+TESTIMONY: Final = pa.struct(
+    [
+        ("witness", pa.string()),
+        ("score", pa.float64()),
+        ("limit", pa.float64()),
+        ("q", pa.float64()),
+        ("unit", pa.string()),
+        ("text", pa.string()),
+    ]
+)
+"""What one witness says of an image: it disagrees where score is above limit and q, where it has one, below alpha."""
+
 CODED_TEXT: Final = pa.dictionary(pa.int32(), pa.string())  # millions of rows, few different texts

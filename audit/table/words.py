@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, Literal
 
+from sfm_audit.audit.table.witnesses import WITNESSES, Witness
+
 
 class Verdict(StrEnum):
     """What is said about one image; undetermined is no pass."""
@@ -166,9 +168,20 @@ class ReasonCode(StrEnum):
     NOISE_DIFFERS = "noise_differs"
     PIXEL_CONVENTION = "pixel_convention"
     DEGENERATE_INPUT = "degenerate_input"
+    PAIRS_DISAGREE = "pairs_disagree"
+    FOLD_DISAGREES = "fold_disagrees"
+    REFERENCE_DISAGREES = "reference_disagrees"
+    PRIORS_DISAGREE = "priors_disagree"
 
 
 MISFIT_CODES: Final[dict[MisfitGroup, ReasonCode]] = {group: ReasonCode(f"misfit_{group}") for group in GROUPS}
+
+WITNESS_CODES: Final[dict[Witness, ReasonCode]] = {
+    Witness.PAIRS: ReasonCode.PAIRS_DISAGREE,
+    Witness.FOLD: ReasonCode.FOLD_DISAGREES,
+    Witness.REFERENCE: ReasonCode.REFERENCE_DISAGREES,
+    Witness.PRIORS: ReasonCode.PRIORS_DISAGREE,
+}
 
 _ALL: Final = tuple(Member)
 
@@ -197,6 +210,13 @@ def _leaves_open(meaning: str, *members: Member, note: str = "") -> ReasonWords:
 
 def _remarks(meaning: str, *members: Member, note: str = "") -> ReasonWords:
     return ReasonWords(members, None, meaning, note)
+
+
+def _testifies(witness: Witness, meaning: str) -> ReasonWords:
+    may_reject = WITNESSES[witness].may_reject
+    makes = Verdict.REJECTED if may_reject else Verdict.UNDETERMINED
+    note = "" if may_reject else "until its false alarms on real photos are known to be rare"
+    return ReasonWords((Member.OUTSIDE,), makes, meaning, note)
 
 
 REASONS: Final[dict[ReasonCode, ReasonWords]] = {
@@ -303,6 +323,16 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
     ReasonCode.DEGENERATE_INPUT: _leaves_open(
         "the correspondences determine no camera: in which way, and the number that says so", *_ALL, note="of calibrate"
     ),
+    ReasonCode.PAIRS_DISAGREE: _testifies(
+        Witness.PAIRS, "verified matches with covisible neighbours contradict the cameras: how many pairs, q"
+    ),
+    ReasonCode.FOLD_DISAGREES: _testifies(
+        Witness.FOLD, "images that should see the same points see two different sets of them: score, group"
+    ),
+    ReasonCode.REFERENCE_DISAGREES: _testifies(
+        Witness.REFERENCE, "the pose is not where the reference has it: how far, and the limit"
+    ),
+    ReasonCode.PRIORS_DISAGREE: _testifies(Witness.PRIORS, "the centre is not where its prior has it: how far, q"),
 }
 
 UNUSABLE: Final = frozenset(

@@ -14,15 +14,16 @@ import pytest
 from joint_reference import with_param
 
 from sfm_audit.audit import AuditConfig, audit_model
-from sfm_audit.audit.decision.from_table import FixedSettingError, MissingColumnError, RedecisionError, redecide
+from sfm_audit.audit.decision.from_table import FixedSettingError, MissingColumnError, redecide
 from sfm_audit.audit.engine import image
 from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
 from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
 from sfm_audit.audit.simulate.demo import demo_scene
 from sfm_audit.audit.simulate.noise import NoiseSpec
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
-from sfm_audit.audit.table import schema
-from sfm_audit.audit.table.words import POLICIES, SEVERITY_ORDER, UNUSABLE, ReasonCode, Verdict
+from sfm_audit.audit.table import build_table, schema
+from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
+from sfm_audit.audit.table.words import POLICIES, REASONS, SEVERITY_ORDER, UNUSABLE, WITNESS_CODES, ReasonCode, Verdict
 
 RUN = AuditConfig()
 SPEC = SceneSpec(num_images=12, points_per_image=150, noise=NoiseSpec(sigma_px=0.5))
@@ -221,11 +222,22 @@ def test_a_column_of_another_version_is_named(broken_images):
     assert caught.value.columns == ("gain_pose", "misfit_details")
 
 
-def test_witnesses_outside_are_not_asked_again(broken_images):
-    at = broken_images.column_names.index("verdict_outside")
-    asked = broken_images.set_column(at, "verdict_outside", pa.array(["accepted"] * broken_images.num_rows))
-    with pytest.raises(RedecisionError, match="verdict_outside"):
-        redecide(asked, RUN, run=RUN)
+def test_what_witnesses_said_is_decided_again(broken_images):
+    said = WitnessStatement(Witness.PAIRS, 0.75, 0.5, "6 of 8 pairs", 0.01)
+    usable = [i for i, behind in enumerate(broken_images["num_inliers"].to_pylist()) if behind]
+    silent, agrees, against = usable[-3:]
+    column = [None] * broken_images.num_rows
+    column[silent], column[agrees], column[against] = [], [replace(said, q=0.9)], [said]
+    field = pa.schema([schema("images").field("testimonies")])
+    fresh = build_table({"testimonies": column}, field).column(0)
+    asked = broken_images.set_column(broken_images.column_names.index("testimonies"), field.field(0), fresh)
+    again = redecide(asked, RUN, run=RUN)
+    verdicts, makes = again["verdict_outside"].to_pylist(), REASONS[WITNESS_CODES[Witness.PAIRS]].makes
+    assert (verdicts[silent], verdicts[agrees], verdicts[against]) == (None, "accepted", makes)
+    assert set(verdicts[: usable[-3]]) == {None}
+    assert "pairs_disagree: 6 of 8 pairs" in again["reasons"].to_pylist()[against]
+    strict = redecide(asked, RUN.model_copy(update={"alpha": 0.009}), run=RUN)
+    assert strict["verdict_outside"].to_pylist()[against] == "accepted"
 
 
 def test_no_images_no_decisions():

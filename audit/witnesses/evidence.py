@@ -1,0 +1,44 @@
+"""What a witness may look at, and what it reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import Finding, PairSource, SparseModel
+
+ColumnValues: TypeAlias = FloatArray | IntArray | BoolArray | tuple[object, ...]
+"""(I,) values of a column of the images table, by row of the images; NaN or None where there is none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What witnesses may look at.
+
+    model, residuals: as they stand.    sigma_px: (I,) robust noise per axis of each image, NaN where unknown.
+    pairs: verified matches of a database; None where none was given.
+    """
+
+    model: SparseModel
+    residuals: ModelResiduals
+    sigma_px: FloatArray
+    pairs: PairSource | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WitnessReport:
+    """What one witness says of a model.
+
+    witness: None for measures that speak in columns and findings only, and not in verdict_outside.
+    testimonies: (I,) of each image, None where it has nothing to say; empty where ``witness`` is None.
+    columns: of the images table, (I,) each.    findings: of the model.
+    """
+
+    witness: Witness | None
+    testimonies: tuple[WitnessStatement | None, ...] = ()
+    columns: Mapping[str, ColumnValues] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
