@@ -15,8 +15,10 @@ needs_corpus = pytest.mark.skipif(not IS_THERE, reason=f"no corpus of real model
 
 REALTRUTH = CORPUS.parent / "realtruth"
 SYMPTOMS = CORPUS.parent / "cases" / "symptoms"
+FOLDS = CORPUS.parent / "folds"
 _HAS_TRUTH = any(REALTRUTH.glob("*/truth.json"))
 needs_realtruth = pytest.mark.skipif(not _HAS_TRUTH, reason=f"no models with ground truth at {REALTRUTH}")
+needs_folds = pytest.mark.skipif(not FOLDS.is_dir(), reason=f"no folded models at {FOLDS}")
 needs_symptoms = pytest.mark.skipif(not SYMPTOMS.is_dir(), reason=f"no models with known faults at {SYMPTOMS}")
 
 UNREADABLE = frozenset({"xiting_lfs", "marychrisgo_nopoints", "kapture_t265_txt"})

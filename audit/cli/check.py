@@ -12,7 +12,8 @@ import click
 from sfm_audit.audit.cli.auditing import print_page, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.gate_file import read_gate_file
-from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
+from sfm_audit.audit.cli.poses import aligned
+from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, without_poses, write_file
 from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.gate import judge
 from sfm_audit.reports.compare.gate_policy import GatePolicy
@@ -65,7 +66,7 @@ def command(
 
 
 def _judged(policy: GatePolicy, run: ComparedRun, baseline: ComparedRun | None) -> GateReport:
-    comparison = compare(baseline.snapshot, run.snapshot) if baseline else None
+    comparison = compare(baseline.snapshot, run.snapshot, aligned) if baseline else None
     checks = judge(policy, run.snapshot, comparison)
     notes = []
     if comparison is not None and comparison.nothing_in_common:
@@ -79,6 +80,7 @@ def _judged(policy: GatePolicy, run: ComparedRun, baseline: ComparedRun | None) 
         notes.append(
             f"the baseline was made by sfm-audit {baseline.info.get('version')}, the run by {run.info.get('version')}"
         )
+    notes += without_poses([each for each in (baseline, run) if each]) if comparison else []
     if not checks:
         notes.append("nothing was checked: the gate file has no limits, and there is no --baseline")
     return GateReport(

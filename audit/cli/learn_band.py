@@ -8,7 +8,8 @@ import click
 
 from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
-from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, write_file
+from sfm_audit.audit.cli.poses import aligned
+from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, without_poses, write_file
 from sfm_audit.reports.compare.learning import gate_toml, learn_bands
 
 _RECOMMENDED = 3
@@ -34,7 +35,9 @@ def command(*, runs: tuple[Path, ...], out: Path | None, force: bool) -> ExitCod
     read = [read_run(folder) for folder in runs]
     refuse_different_settings(read)
     _refuse_unusable(read)
-    content = gate_toml(learn_bands([each.snapshot for each in read]), [str(folder) for folder in runs])
+    content = gate_toml(learn_bands([each.snapshot for each in read], aligned), [str(folder) for folder in runs])
+    for note in without_poses(read):
+        _warn(note)
     if len(runs) < _RECOMMENDED:
         _warn(f"two runs say little about how much a third differs; {_RECOMMENDED} or more are recommended")
     everywhere = set.intersection(*(each.snapshot.scenes for each in read))

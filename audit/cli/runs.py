@@ -94,6 +94,16 @@ def refuse_different_settings(runs: Sequence[ComparedRun]) -> None:
         raise KnownError(f"{problem}; audit both with the same settings", ExitCode.USAGE)
 
 
+def without_poses(runs: Sequence[ComparedRun]) -> list[str]:
+    """Say which runs do not hold the poses of their images, so that nobody takes silence for agreement."""
+    return [
+        f"{run.folder}: made by sfm-audit {run.info.get('version')}, holds no poses, and where cameras are is not "
+        "compared; make the run again"
+        for run in runs
+        if run.snapshot.images and not run.snapshot.has_poses
+    ]
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Write a report file, over an older one; devices such as /dev/stdout are written to.
 

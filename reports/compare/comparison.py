@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
-from typing import Final, NamedTuple
+from typing import Final
 
+from sfm_audit.reports.compare.keys import ImageKey, Noted, Scope
+from sfm_audit.reports.compare.motion import POSE_COLUMNS, Aligner, PoseChange, StoredPose, pose_changes
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 
 IMAGE_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "image_name", "camera_id", "camera_model", "num_inliers"),
     *("sigma_constant_px", "misfit_px", "pose_offset_px", "verdict", "verdict_misfit", "verdict_pose", "reasons"),
+    *POSE_COLUMNS,
 )
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "noise_s0_px", "recomputed_point_error_px"),
@@ -25,36 +28,6 @@ _NEEDED: Final = frozenset({"dataset", "scene", "component", "model_path"})
 REJECTED: Final = "rejected"
 
 _ModelKey = tuple[str, str, str, str]
-
-
-class ImageKey(NamedTuple):
-    """What names an image in every reconstruction of the same photos."""
-
-    dataset: str
-    scene: str
-    image_name: str
-
-
-Noted = tuple[tuple[ImageKey, str], ...]
-
-
-class Scope(NamedTuple):
-    """A part of a run: all of it, a dataset, or a scene of a dataset."""
-
-    dataset: str | None = None
-    scene: str | None = None
-
-    @property
-    def kind(self) -> str:
-        """Either run, dataset or scene."""
-        if self.dataset is None:
-            return "run"
-        return "dataset" if self.scene is None else "scene"
-
-    @property
-    def name(self) -> str:
-        """How people call it."""
-        return "all" if self.dataset is None else "/".join(part for part in self if part is not None)
 
 
 class MissingColumnError(Exception):
@@ -83,6 +56,7 @@ class ImageState:
     noise_s0_px: float | None
     recomputed_error_px: float | None
     systematic: Systematic
+    pose: StoredPose | None = None
 
     @property
     def codes(self) -> frozenset[str]:
@@ -123,6 +97,11 @@ class RunSnapshot:
         return cls(images, {key: frozenset(members[key]) for key in models})
 
     @property
+    def has_poses(self) -> bool:
+        """Whether it holds the pose of an image; runs of older versions do not."""
+        return any(state.pose is not None for state in self.images.values())
+
+    @property
     def scenes(self) -> set[tuple[str, str]]:
         """Dataset and scene of every model."""
         return {(dataset, scene) for dataset, scene, *_ in self.models}
@@ -156,6 +135,7 @@ class ScopeChange:
     was_there: whether the baseline has the scope.    lost_models: its models none of whose images is left.
     grown_px: by how much a systematic error is larger, px, largest first.
     other_verdict: how many images have another verdict, newly rejected and fixed ones among them.
+    poses: where the cameras are, model by model; empty where nobody aligned them.
     """
 
     scope: Scope
@@ -173,12 +153,18 @@ class ScopeChange:
     lost_scenes: tuple[str, ...]
     added_scenes: tuple[str, ...]
     lost_models: tuple[str, ...]
+    poses: tuple[PoseChange, ...] = ()
+
+    @property
+    def moved(self) -> Noted:
+        """Images that are elsewhere after the alignment, sorted."""
+        return tuple(sorted(image for change in self.poses for image in change.moved))
 
     @property
     def anything(self) -> bool:
         """Whether anything that a comparison shows is different."""
         lists = (self.lost, self.added, self.newly_rejected, self.fixed, self.remodelled, self.grown_px)
-        others = (self.other_verdict, self.lost_scenes, self.added_scenes, self.lost_models)
+        others = (self.other_verdict, self.lost_scenes, self.added_scenes, self.lost_models, self.moved)
         return any(lists) or any(others) or self.before != self.after
 
 
@@ -201,13 +187,16 @@ class Comparison:
         return bool(self.before.images) and bool(self.after.images) and not self.whole.num_common
 
 
-def compare(before: RunSnapshot, after: RunSnapshot) -> Comparison:
-    """Compare a run with a baseline."""
+def compare(before: RunSnapshot, after: RunSnapshot, align: Aligner | None = None) -> Comparison:
+    """Compare a run with a baseline; ``align``: aligns the poses of two models, None to leave poses alone."""
+    poses = pose_changes(before.images, after.images, align) if align else ()
     scenes = sorted(before.scenes | after.scenes)
     datasets = sorted({dataset for dataset, _ in scenes})
     scopes = [Scope(), *(Scope(dataset) for dataset in datasets), *(Scope(*scene) for scene in scenes)]
     images = [_by_scope(run.images.values()) for run in (before, after)]
-    return Comparison(before, after, tuple(_change(scope, before, after, *images) for scope in scopes))
+    changes = (_change(scope, before, after, *images) for scope in scopes)
+    placed = (replace(each, poses=tuple(p for p in poses if _holds(each.scope, *p.images[0][:2]))) for each in changes)
+    return Comparison(before, after, tuple(placed))
 
 
 def scope_numbers(run: RunSnapshot) -> dict[Scope, ScopeNumbers]:
@@ -332,6 +321,7 @@ def _image_state(row: Row, model_key: _ModelKey, model: Row, camera: tuple[float
         Systematic(
             found=(misfit * is_misfit, pose * is_moved, of_camera * is_material), seen=(misfit, pose, of_camera)
         ),
+        StoredPose.of(row),
     )
 
 

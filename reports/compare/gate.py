@@ -7,16 +7,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sfm_audit.reports.compare.comparison import (
-    Comparison,
-    Noted,
-    RunSnapshot,
-    Scope,
-    ScopeChange,
-    ScopeNumbers,
-    scope_numbers,
-)
+from sfm_audit.reports.compare.comparison import Comparison, RunSnapshot, ScopeChange, ScopeNumbers, scope_numbers
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits
+from sfm_audit.reports.compare.keys import Noted, Scope
+from sfm_audit.reports.compare.measure import Measure, pose_measures
 from sfm_audit.reports.text.wording import counted
 
 NOT_MEASURED: Final = "not measured"
@@ -36,19 +30,6 @@ class Check:
     value: float | None
     allowed: float | None
     message: str
-    images: Noted = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """One number that a band bounds: how far a scope is from its baseline.
-
-    value: NaN where the baseline has the number and the run has not.    words: the number in words.
-    """
-
-    key: str
-    value: float
-    words: str
     images: Noted = ()
 
 
@@ -105,6 +86,7 @@ def measures(change: ScopeChange) -> Iterator[Measure]:
     yield from _share_measures(before, after)
     yield from _level_measures(before, after)
     yield _systematic(change)
+    yield from pose_measures(change)
 
 
 def _share_measures(before: ScopeNumbers, after: ScopeNumbers) -> Iterator[Measure]:
@@ -233,8 +215,10 @@ def _unmatched(policy: GatePolicy, scopes: Iterable[Scope]) -> Iterator[Check]:
 
 
 def _allowed_words(key: str, allowed: float) -> str:
-    if key in {"lost_scenes", "lost_models"}:
+    if key in {"lost_scenes", "lost_models", "fragments", "pose_centre", "bending"}:
         return f"{allowed:g} allowed"
+    if key == "pose_rotation_deg":
+        return f"{allowed:g} deg allowed"
     if key == "systematic_px":
         return f"+{_px(allowed)} allowed"
     if key in {"median_sigma", "noise_s0", "recomputed_error"}:

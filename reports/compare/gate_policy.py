@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sfm_audit.reports.compare.comparison import Scope
+from sfm_audit.reports.compare.keys import Scope
 
 _Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 _Px = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -43,7 +43,8 @@ class Band(_Section):
     Shares are of the baseline's images (lost_images), of the images in both runs (newly_rejected,
     camera_model_changed), or of the images of each run (share_*: by how much the share may fall or rise).
     median_sigma, noise_s0 and recomputed_error: relative rise, 0.15 for 15 %. systematic_px: by how much the systematic
-    error of any image may grow. inf: not checked.
+    error of any image may grow. fragments: groups of images that moved together; moved_images: share of the images in
+    both runs; pose_centre and bending: median depths; pose_rotation_deg: degrees. inf: not checked.
     """
 
     lost_scenes: _Rise = 0
@@ -58,6 +59,11 @@ class Band(_Section):
     noise_s0: _Rise = 0.15
     recomputed_error: _Rise = 0.15
     systematic_px: _Rise = 0.25
+    fragments: _Rise = 0
+    moved_images: _Rise = 0.05
+    pose_centre: _Rise = 0.02
+    pose_rotation_deg: _Rise = 0.5
+    bending: _Rise = 0.1
 
 
 BAND_KEYS: Final = tuple(Band.model_fields)

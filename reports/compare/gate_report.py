@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sfm_audit.reports.compare.comparison import Comparison, Noted, ScopeChange
+from sfm_audit.reports.compare.comparison import Comparison, ScopeChange
 from sfm_audit.reports.compare.gate import Check
+from sfm_audit.reports.compare.keys import Noted
 from sfm_audit.reports.text.wording import counted
 
 SHAPE: Final = 1  # of the JSON; raised when a key changes its meaning or goes
@@ -91,6 +92,7 @@ def _changes(change: ScopeChange) -> dict[str, Any]:
         "newly_rejected": change.newly_rejected,
         "fixed": change.fixed,
         "camera_model_changed": change.remodelled,
+        "moved": change.moved,
     }
     return {
         "scenes_lost": list(change.lost_scenes),

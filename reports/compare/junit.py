@@ -12,9 +12,9 @@ from itertools import groupby
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from sfm_audit.reports.compare.comparison import Scope
 from sfm_audit.reports.compare.gate import Check
 from sfm_audit.reports.compare.gate_report import GateReport
+from sfm_audit.reports.compare.keys import Scope
 from sfm_audit.reports.text.wording import plain
 
 MAX_NAMES: Final = 200  # images listed per failed check; all are in the JSON

@@ -15,16 +15,20 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import Final
 
-from sfm_audit.reports.compare.comparison import RunSnapshot, Scope, compare
+from sfm_audit.reports.compare.comparison import RunSnapshot, compare
 from sfm_audit.reports.compare.gate import checked_changes, measures
 from sfm_audit.reports.compare.gate_policy import BAND_KEYS, Band
+from sfm_audit.reports.compare.keys import Scope
+from sfm_audit.reports.compare.motion import Aligner
 
 MARGINS: Final = ((5, 2.0), (3, 3.0), (2, 4.0))  # from so many runs on: the factor on the largest difference
 FLOOR_SHARE: Final = 0.5  # of the default band: three runs that happen to agree do not promise that the fourth will
 SYSTEMATIC_MARGIN: Final = 1.5  # px of a camera defect: a factor of 3 would hide what the gate is for
 _KEPT_AT_DEFAULT: Final = frozenset({"systematic_px"})
-_ONE_IMAGE: Final = frozenset({"newly_rejected", "share_accepted", "share_rejected", "share_rejected_by_reason"})
-_COUNTS: Final = frozenset({"lost_scenes", "lost_models"})
+_ONE_IMAGE: Final = frozenset(
+    {"newly_rejected", "share_accepted", "share_rejected", "share_rejected_by_reason", "moved_images"}
+)
+_COUNTS: Final = frozenset({"lost_scenes", "lost_models", "fragments"})
 _SHARES: Final = _ONE_IMAGE | {"lost_images", "camera_model_changed"}
 _DIGITS: Final = 1e4
 _NO_DIGITS: Final = 1e12  # larger ones are rounded as they are
@@ -41,20 +45,21 @@ class LearntBands:
     scenes: Mapping[Scope, Mapping[str, float]]
 
 
-def learn_bands(runs: Sequence[RunSnapshot]) -> LearntBands:
+def learn_bands(runs: Sequence[RunSnapshot], align: Aligner | None = None) -> LearntBands:
     """Learn bands from two or more runs over reconstructions of the same photos.
 
     Notes
     -----
     Levels above the scenes, where there are any, give the bands for all; a scene that varies more gets its own. One
-    image more or less with another verdict is always within the band of a scene.
+    image more or less with another verdict, or elsewhere, is always within the band of a scene.
+    ``align``: see `compare`.
     """
     if len(runs) < 2:
         raise ValueError(f"a band takes two runs or more, got {len(runs)}")
     largest: defaultdict[Scope, dict[str, float]] = defaultdict(lambda: dict.fromkeys(BAND_KEYS, 0.0))
     fewest: dict[Scope, int] = {}
     for before, after in permutations(runs, 2):
-        for change in checked_changes(compare(before, after)):
+        for change in checked_changes(compare(before, after, align)):
             worst = largest[change.scope]
             fewest[change.scope] = min(fewest.get(change.scope, change.num_common), change.num_common)
             for measure in measures(change):

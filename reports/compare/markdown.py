@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from sfm_audit.reports.compare.comparison import Noted
 from sfm_audit.reports.compare.gate import Check
 from sfm_audit.reports.compare.gate_report import GateReport
+from sfm_audit.reports.compare.keys import Noted
 from sfm_audit.reports.text.wording import counted, plain
 
 MAX_BYTES: Final = 1_000_000  # GitHub's limit is 1024 KiB, for all that one step writes
@@ -77,6 +77,7 @@ def _changes(report: GateReport) -> Iterator[str]:
         "lost": change.lost,
         "added": change.added,
         "with another camera model": change.remodelled,
+        "with a camera elsewhere": change.moved,
     }
     yield from (f"| {name} | {len(keys)} |\n" for name, keys in lists.items())
     for name, keys in lists.items():

@@ -7,8 +7,9 @@ from typing import Final
 
 from rich.cells import cell_len
 
-from sfm_audit.reports.compare.comparison import Comparison, Noted, ScopeChange
+from sfm_audit.reports.compare.comparison import Comparison, ScopeChange
 from sfm_audit.reports.compare.gate_report import GateReport
+from sfm_audit.reports.compare.keys import Noted
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
 from sfm_audit.reports.text.wording import MISSING, counted, paragraph, plain, px, shorten
@@ -93,7 +94,8 @@ def _scene_lists(change: ScopeChange, page: Page) -> list[str]:
 def _image_lists(comparison: Comparison, page: Page) -> list[str]:
     change = comparison.whole
     grown = tuple((key, f"+{growth:.2f} px") for key, growth in change.grown_px)
-    parts = []
+    folds = [fragment for each in change.poses for fragment in each.fragments]
+    parts = [paragraph(f"Fold: {plain(fragment.words)}", page.width, "  ") for fragment in folds[:MAX_NAMES]]
     for title, images in (
         ("Newly rejected", change.newly_rejected),
         ("Fixed", change.fixed),
@@ -101,6 +103,7 @@ def _image_lists(comparison: Comparison, page: Page) -> list[str]:
         ("Added", change.added),
         ("Another camera model", change.remodelled),
         ("Larger systematic error", grown),
+        ("Cameras elsewhere", change.moved),
     ):
         if images:
             parts.append("\n".join([f"{title}: {counted(len(images), 'image')}", *_name_lines(images, page)]))

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from sfm_audit.reports.compare.comparison import ImageKey, ImageState, RunSnapshot, Scope, Systematic, compare
+from sfm_audit.reports.compare.comparison import ImageState, RunSnapshot, Systematic, compare
+from sfm_audit.reports.compare.keys import ImageKey, Scope
 from sfm_audit.reports.compare.page import MAX_NAMES, render_comparison
 from sfm_audit.reports.text.drawing import Page
 
@@ -139,7 +140,7 @@ def test_a_scene_of_a_camera_that_bends_is_a_systematic_error_of_its_images():
     state = ImageState(
         ImageKey("d", "s", "a"), MODEL, 5, "accepted", (), None, None, None, None, Systematic((0.0,), (0.1,))
     )
-    worse = ImageState(*(getattr(state, f) for f in state.__slots__[:-1]), Systematic((0.7,), (0.7,)))
+    worse = replace(state, systematic=Systematic((0.7,), (0.7,)))
     runs = [RunSnapshot({each.key: each}, {MODEL: frozenset([each.key])}) for each in (state, worse)]
     [(_, growth)] = compare(*runs).whole.grown_px
     assert growth == pytest.approx(0.6)

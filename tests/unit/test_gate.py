@@ -9,9 +9,10 @@ from gate_samples import NASTY, but, rejected, scene, without, write_run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sfm_audit.reports.compare.comparison import RunSnapshot, Scope, compare
+from sfm_audit.reports.compare.comparison import RunSnapshot, compare
 from sfm_audit.reports.compare.gate import judge
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy
+from sfm_audit.reports.compare.keys import Scope
 from sfm_audit.reports.compare.learning import gate_toml, learn_bands
 
 EMPTY = GatePolicy()
