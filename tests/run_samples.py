@@ -137,7 +137,7 @@ def run_cli(*args: str | Path, stub: str | None = None, **options: Any) -> tuple
     return process.returncode, out, err
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+def wait_for(condition: Callable[[], Any], seconds: float = 180.0) -> Any:
     """Wait until a condition holds and return its value."""
     end = time.monotonic() + seconds
     while not (value := condition()):

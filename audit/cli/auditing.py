@@ -5,17 +5,16 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
-import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
-from sfm_audit.audit.cli.finding import Wanted, find_models
 from sfm_audit.audit.cli.progress import Progress
+from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.schedule.errors import ClusterError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
@@ -25,7 +24,6 @@ from sfm_audit.loaders import Discovery
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.store import RunFailure, RunSettings, RunStore
-from sfm_audit.reports.text.drawing import Page
 from sfm_audit.reports.text.summary import render_summary
 
 _INPUT_KINDS: Final = frozenset({"unreadable", "too_large"})
@@ -38,7 +36,6 @@ class RunRequest:
     jobs: number of processes, None for as many as there are CPUs and work for them.
     observations: whether to write a row per inlier too.
     dask: address of a Dask scheduler, or "local"; None without Dask.
-    wanted: which models below the PATHs.
     limits: what the audit of one may take.    verify: whether to read unchanged inputs again.
     """
 
@@ -49,13 +46,12 @@ class RunRequest:
     quiet: bool = False
     observations: bool = False
     dask: str | None = None
-    wanted: Wanted = field(default_factory=Wanted)
     limits: Limits = NO_LIMITS
     verify: bool = False
 
 
-def run_audit(request: RunRequest) -> ExitCode:
-    """Audit what lies below the PATHs into a run folder; one line on stderr per input that cannot be read.
+def run_audit(request: RunRequest, found: Discovery) -> ExitCode:
+    """Audit what was found below the PATHs into a run folder; one line on stderr per input that cannot be read.
 
     Raises
     ------
@@ -65,7 +61,6 @@ def run_audit(request: RunRequest) -> ExitCode:
     if request.dask is not None and importlib.util.find_spec("distributed") is None:
         raise KnownError("--dask needs the extra cluster: pip install 'sfm-audit[cluster]'", ExitCode.USAGE)
     start = time.perf_counter()
-    found = find_models(request.paths, request.wanted)
     problems = [RunFailure(error.path, str(error)) for error in found.errors]
     if found.refs:
         try:
@@ -99,24 +94,6 @@ def print_summary(folder: Path) -> None:
         print_page(render_summary(RunReader.open(folder), terminal_page()))
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
-
-
-def print_page(text: str) -> None:
-    """Print to stdout in its own encoding; a reader that left, as ``head`` does, is no error."""
-    encoding = sys.stdout.encoding or "utf-8"
-    try:
-        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
-
-
-def terminal_page() -> Page:
-    """Return how to draw on stdout: as wide as the terminal, 80 columns elsewhere."""
-    is_terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size((80, 24)).columns if is_terminal else 80
-    return Page(
-        width, (sys.stdout.encoding or "").lower().startswith("utf"), is_terminal and "NO_COLOR" not in os.environ
-    )
 
 
 def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure], start: float) -> None:

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
+from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.table.words import POLICIES
 from sfm_audit.loaders.errors import LoadError

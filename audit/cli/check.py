@@ -9,11 +9,11 @@ from pathlib import Path
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.gate_file import read_gate_file
 from sfm_audit.audit.cli.poses import aligned
 from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, without_poses, write_file
+from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.gate import judge
 from sfm_audit.reports.compare.gate_policy import GatePolicy

@@ -12,8 +12,10 @@ from typing import Final
 import click
 import numpy as np
 
-from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit, terminal_page
+from sfm_audit.audit.cli.auditing import RunRequest, print_summary, run_audit
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.finding import Wanted, find_models
+from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.simulate.adjust import write_adjusted_model
 from sfm_audit.audit.simulate.defects import DefectKind
@@ -48,7 +50,10 @@ def command(*, out: Path, seed: int, quiet: bool) -> ExitCode:
     _refuse_foreign_folder(out)
     _say(quiet, f"Simulating and adjusting a photo collection (seed {seed}) ...")
     truth = _simulate(out, seed)
-    exit_code = run_audit(RunRequest([str(out / "photos")], out / "run", AuditConfig(), jobs=1, quiet=quiet))
+    paths = [str(out / "photos")]
+    exit_code = run_audit(
+        RunRequest(paths, out / "run", AuditConfig(), jobs=1, quiet=quiet), find_models(paths, Wanted())
+    )
     if not quiet:
         print_summary(out / "run")
         print_page(_comparison(RunReader.open(out / "run"), truth))

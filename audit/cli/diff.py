@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page, terminal_page
 from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.poses import aligned
 from sfm_audit.audit.cli.runs import different_settings, read_run, without_poses
+from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.page import render_comparison
 

@@ -7,10 +7,10 @@ from typing import Any, Final, get_args
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.cli.terminal import print_page
 from sfm_audit.audit.config import NoiseName, PointsName
 from sfm_audit.audit.table.words import POLICIES
 from sfm_audit.loaders import LoadError, SparseModel, discover, open_model

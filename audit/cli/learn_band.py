@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.poses import aligned
 from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, without_poses, write_file
+from sfm_audit.audit.cli.terminal import print_page
 from sfm_audit.reports.compare.learning import gate_toml, learn_bands
 
 _RECOMMENDED = 3

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from sfm_audit.audit.cli.auditing import print_page
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.runs import open_run
+from sfm_audit.audit.cli.terminal import print_page
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.new_files import OutputExistsError, check_free, write_file
 from sfm_audit.reports.text.wording import counted, plain

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from sfm_audit.audit.cli.auditing import RunRequest, print_page, print_summary, run_audit
 from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.finding import CHOICE_OF_MODELS, find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.cli.terminal import print_page
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
-from sfm_audit.audit.schedule.task import Limits
 from sfm_audit.audit.table.words import POLICIES
+
+if TYPE_CHECKING:
+    from sfm_audit.audit.schedule.task import Limits
 
 _DEFAULTS = AuditConfig()
 
@@ -97,14 +100,18 @@ def command(  # one parameter per option
     """
     config = read_config(config_file, {name: options[name] for name in ("noise", "points", "min_effect", "policy")})
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
-    if options["only_list"]:
-        lines, problems = listed(find_models(paths, wanted))
-        print_page("\n".join(lines))
-        for problem in problems:
-            complain(problem)
-        return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
-    if out is None:
+    if out is None and not options["only_list"]:
         raise click.UsageError("Missing option '-o': the folder for the tables.")
+    found = find_models(paths, wanted)
+    if out is None or options["only_list"]:
+        lines, problems = listed(found)
+        print_page("\n".join(lines))
+        return _refuse(problems)
+    if not found.refs:
+        return _refuse([str(error) for error in found.errors])
+    # what audits costs most of a second to import: --help and a wrong option, config or PATH need not wait for it
+    from sfm_audit.audit.cli.auditing import RunRequest, print_summary, run_audit  # noqa: PLC0415
+
     request = RunRequest(
         paths,
         out,
@@ -113,17 +120,24 @@ def command(  # one parameter per option
         options["quiet"],
         options["observations"],
         options["dask"],
-        wanted,
         _limits(options["max_model_gb"], options["max_model_memory"], options["max_model_seconds"]),
         options["verify"],
     )
-    exit_code = run_audit(request)
+    exit_code = run_audit(request, found)
     if not options["quiet"] and (out / "run.json").exists():
         print_summary(out)
     return exit_code
 
 
+def _refuse(problems: Sequence[str]) -> ExitCode:
+    for problem in problems:
+        complain(problem)
+    return ExitCode.UNREADABLE_INPUT if problems else ExitCode.OK
+
+
 def _limits(input_gb: float | None, memory_gb: float | None, seconds: float | None) -> Limits:
+    from sfm_audit.audit.schedule.task import Limits  # noqa: PLC0415 - as above
+
     if memory_gb is not None and not Path("/proc/self/statm").exists():
         raise click.UsageError("--max-model-memory: this operating system does not say how much a process has.")
     return Limits(_bytes(input_gb), _bytes(memory_gb), seconds)

@@ -1,0 +1,39 @@
+"""What --help and an error must not import: whoever mistyped waits for the interpreter, not for libraries."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("scipy", "pandas", "pycolmap", "matplotlib", "pyarrow.dataset", "sfm_audit.audit.engine")
+ASK = """
+import sys
+from sfm_audit.audit.cli.main import main
+code = main(sys.argv[2:])
+loaded = [name for name in sys.argv[1].split() if name in sys.modules]
+print(code, *loaded, file=sys.stderr)
+"""
+QUICK = {
+    "run --help": 0,
+    "run": 2,
+    "run no-such-folder": 2,
+    "run no-such-folder -o out": 3,
+    "run no-such-folder --list": 3,
+    "run . -o out --noise loud": 2,
+    "run . -o out --config no-such-file.toml": 2,
+    "run . -o out --jobs many": 2,
+    "check no-such-run --policy-file no-such-file.toml": 2,
+    "diff no-such-run another": 3,
+    "learn-band no-such-run another": 3,
+    "no-such-verb": 2,
+    "--version": 0,
+}
+
+
+@pytest.mark.parametrize("line", QUICK)
+def test_nothing_heavy_is_imported_for_help_and_errors(line, tmp_path):
+    command = [sys.executable, "-c", ASK, " ".join(HEAVY), *line.split()]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.stderr.splitlines()[-1].split() == [str(QUICK[line])], ended.stderr
