@@ -29,6 +29,13 @@ class AuditConfig(BaseModel):
         description="whether the 3D points were triangulated from these images (in-sample) or measured otherwise "
         "(independent: nothing to undo; takes noise = constant)",
     )
+    database: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=4096,
+        description="the database.db whose verified pairs are asked (docs/witnesses.md); auto: the one beside each "
+        "model or up to three folders above it",
+    )
     policy: PolicyName = Field(
         default="standard",
         description="which verdicts decide: standard = misfit, camera, pose, plausible, noise, outside; camera = the "

@@ -7,8 +7,9 @@ from typing import TypeVar
 
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.colmap.formats import BINARY, TEXT
+from sfm_audit.loaders.colmap.pairs import database_pairs
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import PairSource, SparseModel
 from sfm_audit.loaders.model_format import ModelFormat, ModelWriter
 from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
@@ -104,6 +105,22 @@ def keypoint_scales_of(model: SparseModel, shown_as: str) -> FloatArray:
         wanted, got = "a format that keeps the sizes of keypoints", f"the format {model.file_format}"
         raise LoadError(shown_as, None, wanted, got, "use --noise track")
     return scales(model, shown_as)
+
+
+def verified_pairs_of(model: SparseModel, database: str | None, shown_as: str) -> PairSource | None:
+    """Return the verified pairs of a model; None where no database was named.
+
+    Parameters
+    ----------
+    database : its location, or ``auto``: the one that belongs to the model, where there is one
+    shown_as : the model's location for messages
+
+    Raises
+    ------
+    LoadError
+        The named database cannot be read, or does not fit the model.
+    """
+    return None if database is None else database_pairs(model, database, shown_as)
 
 
 def _incomplete(folder: InputPath, there: list[str]) -> MissingFileError:

@@ -61,6 +61,12 @@ class FindingCode(StrEnum):
     IMPLIED_TANGENTIAL = "implied_tangential"
     JOINT_IN_BLOCKS = "joint_in_blocks"
     NOISE_PRIOR_NOT_CONVERGED = "noise_prior_not_converged"
+    CONTRADICTED_PAIRS = "contradicted_pairs"
+    DATABASE_NOT_USED = "database_not_used"
+    DISCONNECTED = "disconnected"
+    WEAKLY_CONNECTED = "weakly_connected"
+    RIG_POSE_DISAGREES = "rig_pose_disagrees"
+    RIG_NOT_CONSTANT = "rig_not_constant"
 
 
 FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
@@ -105,6 +111,12 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.JOINT_IN_BLOCKS: "the model is too large for one joint system; it was solved in blocks of covisibility",
     FindingCode.NOISE_PRIOR_NOT_CONVERGED: "the prior of the track noise did not converge: KS rests on what it reached",
     FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES: "too many images are away from their optimum to leave them out",
+    FindingCode.CONTRADICTED_PAIRS: "verified pairs that the cameras contradict: a fold, or false pairs left out",
+    FindingCode.DATABASE_NOT_USED: "there is no database.db, or it does not fit the model: its pairs were not asked",
+    FindingCode.DISCONNECTED: "parts of the model share too few points: their poses relative to each other are free",
+    FindingCode.WEAKLY_CONNECTED: "parts of the model hang together by few points, or by one image or pair alone",
+    FindingCode.RIG_POSE_DISAGREES: "poses in the images file differ from those of frames and rigs, which were read",
+    FindingCode.RIG_NOT_CONSTANT: "images of a rig would move against their frame: the rig is not rigid, or misplaced",
 }
 """One line per finding, for docs/findings.md."""
 
@@ -293,23 +305,26 @@ class SparseModel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MatchedPairs:
-    """Verified matches of some pairs of images.
+class MatchedPair:
+    """Verified matches of two images.
 
-    image_idx: (k, 2) rows of ImageTable, the first smaller.    offsets: (k + 1,), pair i owns matches
-    offsets[i]:offsets[i + 1].    xy_px: (2, m, 2) of both images, px, as observed.
+    first_idx, second_idx: rows of ImageTable.    keypoint_idx: (m, 2) positions in POINTS2D of both.
     """
 
-    image_idx: IntArray
-    offsets: IntArray
-    xy_px: FloatArray
+    first_idx: int
+    second_idx: int
+    keypoint_idx: UInt32Array
 
 
 class PairSource(Protocol):
-    """Where verified matches come from, some pairs at a time: there may be more of them than memory holds."""
+    """Where verified matches come from, a pair at a time: there may be more of them than memory holds."""
 
-    def batches(self) -> Iterator[MatchedPairs]:
-        """Go through all pairs whose two images the model has."""
+    def pairs(self) -> Iterator[MatchedPair]:
+        """Go through the verified pairs whose two images the model has; LoadError where they cannot be read."""
+        ...
+
+    def keypoints_px(self, image_idx: int) -> FloatArray:
+        """Return (num_points2d, 2) all 2D points of the image, px; LoadError where they cannot be read."""
         ...
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.projected import project_image
@@ -100,3 +101,16 @@ def solved(columns, y):
     scale[scale == 0] = 1.0
     pinv = np.linalg.pinv(columns / scale, rcond=1e-7)
     return (pinv @ y) / scale, (pinv @ pinv.T) / scale / scale[:, None]
+
+
+def with_rig(model):
+    """Images 2k and 2k + 1 as one frame, the first of them at the rig's origin."""
+    quat, shift = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
+    poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(quat), 1))
+    turned = Rotation.from_quat(np.roll(quat, -1, axis=1))
+    second = turned[1::2] * turned[::2].inv()
+    poses[1::2, :4] = np.roll(second.as_quat(), 1, axis=1)
+    poses[1::2, 4:] = shift[1::2] - second.apply(shift[::2])
+    frame_idx = np.arange(len(quat)) // 2
+    images = dataclasses.replace(model.images, frame_idx=frame_idx, pose_cam_from_rig=poses)
+    return dataclasses.replace(model, images=images)

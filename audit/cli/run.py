@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sfm_audit.audit.schedule.task import Limits
 
 _DEFAULTS = AuditConfig()
+_SETTINGS = ("noise", "points", "min_effect", "policy", "database")
 
 
 @click.command("run", short_help="Audit reconstructions and write the tables into a run folder.")
@@ -49,6 +50,11 @@ _DEFAULTS = AuditConfig()
     "--min-effect",
     metavar="TAU",
     help=f"Misfit that matters, such as 0.2px or 0.5sigma.  [default: {_DEFAULTS.min_effect}]",
+)
+@click.option(
+    "--database",
+    metavar="DB|auto",
+    help="Ask the verified pairs of this database.db, or of the one beside or above each model.",
 )
 @click.option(
     "--policy",
@@ -98,7 +104,7 @@ def command(  # one parameter per option
     (the rest was audited and written); 4 RUN could not be written; 5 a bug or a limit stopped single models (traceback
     in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
-    config = read_config(config_file, {name: options[name] for name in ("noise", "points", "min_effect", "policy")})
+    config = read_config(config_file, {name: options[name] for name in _SETTINGS})
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
     if out is None and not options["only_list"]:
         raise click.UsageError("Missing option '-o': the folder for the tables.")

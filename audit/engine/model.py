@@ -342,7 +342,8 @@ class ModelAuditor:
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
-        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions)
+        asked = self.outside.witnesses
+        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions, asked)
         return ModelAudit(
             images_table(rows),
             table_of("cameras", [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]),

@@ -23,6 +23,7 @@ from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.columns import IMPLIED, OUTSIDE_COLUMNS, own_parameter_names
+from sfm_audit.audit.table.witnesses import Witness
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
@@ -295,8 +296,9 @@ def model_row(
     errors: StoredErrors,
     findings: Sequence[Finding],
     decisions: Sequence[Decision],
+    witnesses: Sequence[Witness] = (),
 ) -> Row:
-    """Return the row of one model; ``decisions`` about its images."""
+    """Return the row of one model; ``decisions`` about its images; ``witnesses`` that were asked of them."""
     total_sq = tracks.statistics.total_sq_px2
     counts = {"": Counter(decision.verdict for decision in decisions)}
     for member in Member:
@@ -319,5 +321,6 @@ def model_row(
         "removable_share": tracks.statistics.removable_sq_px2 / total_sq if total_sq > 0 else math.nan,
         "num_nonstationary_images": int(np.count_nonzero(tracks.nonstationary)),
         **{f"num_{verdict}{name}": count[verdict] for name, count in counts.items() for verdict in Verdict},
+        "witnesses": [str(each) for each in witnesses] or None,
         "findings": list(findings),
     }

@@ -15,7 +15,7 @@ from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders import LoadError, ModelRef, open_model
 from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
-from sfm_audit.loaders.formats import keypoint_scales_of
+from sfm_audit.loaders.formats import keypoint_scales_of, verified_pairs_of
 
 FailureKind = Literal["unreadable", "too_large", "memory", "time", "died", "error"]
 
@@ -107,12 +107,15 @@ def audit_one(task: Task) -> Outcome:
                 return Unchanged()
             model = open_model(ref.location)
             scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
+            pairs = verified_pairs_of(model, task.config.database, ref.model_path)
         except LoadError as error:
             return Failure(ref.model_path, str(error))
         except MemoryError:
             return _too_large_to_read(task)
         labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
-        audited = audit_model(model, task.config, labels, scale_px, observations=task.observations, spread=spread)
+        audited = audit_model(
+            model, task.config, labels, scale_px, observations=task.observations, spread=spread, pairs=pairs
+        )
     return Audited(state, audited.tables, time.perf_counter() - start)
 
 

@@ -117,12 +117,19 @@ IMPLIED: Final = {
 """Columns of parameters that nobody freed (method.md section 11)."""
 
 _OUTSIDE: Final = (
-    count("num_pairs_strong", "verified pairs with covisible images, of at least 60 matches; null without a database"),
+    count("num_pairs_strong", "its verified pairs of at least 60 matches; null without a database (--database)"),
     count("num_pairs_contradicting", "of these, pairs that the two cameras contradict in most of their matches"),
-    number("pairs_p", "p-value of so many contradicting pairs under the rate of the model's other pairs"),
+    count("num_pairs_covisible", "of its strong pairs, those with images that share at least 15 points with it"),
+    count("num_pairs_covisible_contradicting", "of these, contradicting ones"),
+    number("pairs_p", "p-value of so many contradicting covisible pairs under the rate of the model's other pairs"),
     number("pairs_q", "Benjamini-Hochberg q-value of pairs_p over the model's images"),
+    count("num_neighbours", "images that share at least 15 points with it"),
+    count("num_shared_strongest", "points that it shares with its strongest neighbour"),
+    count("covisible_part", "which part of the model it is in at 15 shared points; 0 is the largest"),
+    flag("is_articulation", "whether the model falls apart without it"),
+    px("rig_offset_px", "what moving it alone, against its frame, would remove; null where no rig places it"),
 )
-OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.unit != "count" else None for column in _OUTSIDE}
+OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.type == pa.float64() else None for column in _OUTSIDE}
 """What witnesses outside of the image measure, and what stands there where they measured nothing."""
 
 IMAGES: Final[tuple[Column, ...]] = (
@@ -273,6 +280,7 @@ MODELS: Final[tuple[Column, ...]] = (
         for member in _ORDER_OF_COUNTS
         for verdict in Verdict
     ),
+    texts("witnesses", "witnesses outside of the images that were asked (docs/witnesses.md); null where none was"),
     Column("findings", list_of(_FINDING), "text", "inconsistencies of the model: code, how many items, one line each"),
 )
 

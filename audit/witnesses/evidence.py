@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy.typing as npt
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.witnesses.covisibility import Covisibility, covisibility
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, PairSource, SparseModel
 
-ColumnValues: TypeAlias = FloatArray | IntArray | BoolArray | tuple[object, ...]
+ColumnValues: TypeAlias = npt.NDArray[Any] | tuple[object, ...]
 """(I,) values of a column of the images table, by row of the images; NaN or None where there is none."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What witnesses may look at.
 
@@ -27,6 +31,11 @@ class Evidence:
     residuals: ModelResiduals
     sigma_px: FloatArray
     pairs: PairSource | None = None
+
+    @cached_property
+    def seen(self) -> Covisibility:
+        """Which images share how many points."""
+        return covisibility(self.residuals, len(self.model.points))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.assembly.raw import CAMERA_SENSOR, IDENTITY_POSE, Pose, RawFrame, RawImages, RawModel, RawRig
-from sfm_audit.loaders.model import Finding, FindingCode
+from sfm_audit.loaders.model import Finding, FindingCode, rotation_from_quat
+
+MAX_TURN_DEG: Final = 0.01
+MAX_SHIFT: Final = 1e-3
+"""Between the two poses of an image, degrees and shares of the extent of all centres: more than rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +67,10 @@ def compose_poses(raw: RawModel) -> tuple[PlacedImages, tuple[Finding, ...]]:
     if parts.rows:
         with np.errstate(invalid="ignore", over="ignore"):  # a non-finite pose is a finding, not an error
             poses[parts.rows] = compose(np.array(parts.sensor_from_rig), np.array(parts.rig_from_world))
-    findings = _not_placed(images, parts.problems), _not_there(images, frames), _sensors_disagree(raw, rigs, frames)
+    findings = (
+        *(_not_placed(images, parts.problems), _not_there(images, frames), _sensors_disagree(raw, rigs, frames)),
+        _other_poses(images, poses),
+    )
     return _placed(poses, parts), tuple(finding for some in findings for finding in some)
 
 
@@ -117,6 +125,32 @@ def _not_placed(images: RawImages, problems: dict[int, str]) -> tuple[Finding, .
         f"file, e.g. image {images.image_id[row]} {problem}"
     )
     return (Finding(FindingCode.INCOMPLETE_RIGS, count, text),)
+
+
+def _other_poses(images: RawImages, placed: FloatArray) -> tuple[Finding, ...]:
+    """Compare the poses of the images file with those that frames and rigs place; the latter are read."""
+    with np.errstate(all="ignore"):
+        own, read = (
+            rotation_from_quat(each[:, :4] / np.linalg.norm(each[:, :4], axis=1, keepdims=True))
+            for each in (images.poses, placed)
+        )
+        cosine = (np.einsum("nij,nij->n", own, read) - 1.0) / 2.0
+        turned_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        centre, other = (-np.einsum("nji,nj->ni", r, each[:, 4:]) for r, each in ((read, placed), (own, images.poses)))
+        extent = np.linalg.norm(centre - np.median(centre, axis=0), axis=1)
+        scale = max(float(np.median(extent[np.isfinite(extent)])), 1e-9) if np.isfinite(extent).any() else np.nan
+        shifted = np.linalg.norm(other - centre, axis=1) / scale
+        differs = (turned_deg > MAX_TURN_DEG) | (shifted > MAX_SHIFT)
+    count = int(np.count_nonzero(differs))
+    if not count:
+        return ()
+    worst = int(np.nanargmax(np.where(differs, turned_deg, -1.0)))
+    text = (
+        f"the images file has other poses than frames and rigs, which were read, for {count} of {len(placed)} images: "
+        f"up to {turned_deg[worst]:.3g} degrees (image {images.image_id[worst]}), {np.nanmax(shifted[differs]):.3g} of "
+        f"the cameras' extent; programs that read the images file alone see another model"
+    )
+    return (Finding(FindingCode.RIG_POSE_DISAGREES, count, text),)
 
 
 def _not_there(images: RawImages, frames: Sequence[RawFrame]) -> tuple[Finding, ...]:

@@ -32,7 +32,7 @@ DATABASE_NAME: Final = "database.db"
 _LEVELS_UP: Final = 3
 _MAGIC: Final = b"SQLite format 3\0"
 _HEADER_BYTES: Final = 100
-_OTHER_DATABASE: Final = "give the database that this model was made from, or choose another noise model"
+OTHER_DATABASE: Final = "give the database that this model was made from, or do without it"
 
 T = TypeVar("T")
 
@@ -100,14 +100,14 @@ def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes
     (COLMAP 4.2, src/colmap/feature/types.cc).
     """
     path = Path(path)
-    _check_file(path)
+    check_database(path)
     images, observations = model.images, model.observations
     scale = np.full(len(observations), np.nan)
     orientation = np.full(len(observations), np.nan)
-    with closing(_asked(path, lambda: open_database(path))) as db:
-        rows_of = _asked(path, lambda: _rows_by_name(path, db, frozenset(images.name)))
+    with closing(asked(path, lambda: open_database(path))) as db:
+        rows_of = asked(path, lambda: rows_by_name(path, db, frozenset(images.name)))
         for image_idx, name in enumerate(images.name):
-            keypoints = _keypoints_of(path, db, (name, rows_of.get(name)), int(images.num_points2d[image_idx]))
+            keypoints = stored_keypoints(path, db, (name, rows_of.get(name)), int(images.num_points2d[image_idx]))
             rows = slice(*observations.offsets[image_idx : image_idx + 2])
             linked = keypoints[observations.point2d_idx[rows], 2:].astype(np.float64)
             scale[rows], orientation[rows] = _shape_of(linked)
@@ -149,11 +149,11 @@ def _shape_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (np.hypot(a11, a21) + np.hypot(a12, a22)), np.arctan2(a21, a11)
 
 
-_Rows = tuple[int, int | None]
+StoredRows = tuple[int, int | None]
 """Id of an image, and the row of its keypoints, None where it has none."""
 
 
-def _rows_by_name(path: Path, db: sqlite3.Connection, wanted: frozenset[str]) -> dict[str, _Rows]:
+def rows_by_name(path: Path, db: sqlite3.Connection, wanted: frozenset[str]) -> dict[str, StoredRows]:
     """Return id and keypoint row of the images of the given names.
 
     Raises
@@ -166,9 +166,9 @@ def _rows_by_name(path: Path, db: sqlite3.Connection, wanted: frozenset[str]) ->
         if not isinstance(name, str) or name not in wanted:
             continue
         if not isinstance(image_id, int):
-            raise _malformed(path, f"an id of the image {name!r}", f"{image_id!r:.40}")
+            raise malformed(path, f"an id of the image {name!r}", f"{image_id!r:.40}")
         if name in ids:
-            raise _malformed(path, f"one image called {name!r}", f"images {ids[name]} and {image_id}")
+            raise malformed(path, f"one image called {name!r}", f"images {ids[name]} and {image_id}")
         ids[name] = image_id
     names = {image_id: name for name, image_id in ids.items()}
     keypoints: dict[int, int] = {}
@@ -176,39 +176,39 @@ def _rows_by_name(path: Path, db: sqlite3.Connection, wanted: frozenset[str]) ->
         if image_id not in names:
             continue
         if image_id in keypoints:
-            raise _malformed(path, f"one row of keypoints for image {image_id} ({names[image_id]!r})", "two")
+            raise malformed(path, f"one row of keypoints for image {image_id} ({names[image_id]!r})", "two")
         keypoints[image_id] = row
     return {name: (image_id, keypoints.get(image_id)) for name, image_id in ids.items()}
 
 
-def _keypoints_of(
-    path: Path, db: sqlite3.Connection, image: tuple[str, _Rows | None], num_points2d: int
+def stored_keypoints(
+    path: Path, db: sqlite3.Connection, image: tuple[str, StoredRows | None], num_points2d: int
 ) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Return the (num_points2d, 2 | 4 | 6) keypoints of an image: its name, and its rows in the database."""
     name, found = image
     if found is None:
-        raise LoadError(str(path), None, f"the image {name!r} of the model", "no image of that name", _OTHER_DATABASE)
+        raise LoadError(str(path), None, f"the image {name!r} of the model", "no image of that name", OTHER_DATABASE)
     image_id, row = found
     rows, cols, data = 0, 2, b""
     if row is not None:  # else the image has no row in the table of keypoints
         query = "SELECT rows, cols, data FROM keypoints WHERE rowid = ?"
-        stored = _asked(path, lambda: db.execute(query, (row,)).fetchone())
+        stored = asked(path, lambda: db.execute(query, (row,)).fetchone())
         if stored is None:  # a damaged table: a walk finds the row, a search does not
-            raise _malformed(path, f"the keypoints of image {image_id} ({name!r}) in row {row}", "no such row")
+            raise malformed(path, f"the keypoints of image {image_id} ({name!r}) in row {row}", "no such row")
         rows, cols, data = stored
     where = f"keypoints of image {image_id} ({name!r})"
     if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols in {2, 4, 6}):
-        raise _malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r:.40} rows and {cols!r:.40} columns")
+        raise malformed(path, f"{where} with 2, 4 or 6 columns", f"{rows!r:.40} rows and {cols!r:.40} columns")
     data = data or b""
     if not isinstance(data, bytes) or len(data) != rows * cols * 4:
         got = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
-        raise _malformed(path, f"{where} in {rows * cols * 4} bytes ({rows} x {cols} float32)", got)
+        raise malformed(path, f"{where} in {rows * cols * 4} bytes ({rows} x {cols} float32)", got)
     if rows != num_points2d:
-        raise LoadError(str(path), None, f"{num_points2d} {where}, as in the model", f"{rows}", _OTHER_DATABASE)
+        raise LoadError(str(path), None, f"{num_points2d} {where}, as in the model", f"{rows}", OTHER_DATABASE)
     return np.frombuffer(data, dtype="<f4").reshape(rows, cols)
 
 
-def _check_file(path: Path) -> None:
+def check_database(path: Path) -> None:
     """Raise unless ``path`` is a whole SQLite database that nobody is writing to.
 
     A database cut short opens without complaint and fails only where a page is missing, so its size is compared with
@@ -218,7 +218,7 @@ def _check_file(path: Path) -> None:
     with file:
         header = file.read(_HEADER_BYTES)
     if header[: len(_MAGIC)] != _MAGIC[: len(header)]:
-        raise _malformed(path, "a SQLite database", f"a file that starts with {header[:16]!r}")
+        raise malformed(path, "a SQLite database", f"a file that starts with {header[:16]!r}")
     page_bytes = int.from_bytes(header[16:18], "big")
     page_bytes = 65536 if page_bytes == 1 else page_bytes
     wanted = max(_HEADER_BYTES, page_bytes * int.from_bytes(header[28:32], "big"))
@@ -230,13 +230,14 @@ def _check_file(path: Path) -> None:
         raise UnreadableFileError(str(path), None, "a database that is not in use", f"changes in {log.name}", advice)
 
 
-def _asked(path: Path, question: Callable[[], T]) -> T:
+def asked(path: Path, question: Callable[[], T]) -> T:
     """Return the answer of SQLite; its errors, and text that is not UTF-8, become a LoadError."""
     try:
         return question()
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise _malformed(path, "COLMAP's tables of images and keypoints", str(error)) from error
+        raise malformed(path, "COLMAP's tables of images and keypoints", str(error)) from error
 
 
-def _malformed(path: Path, wanted: str, got: str) -> MalformedFileError:
-    return MalformedFileError(str(path), None, wanted, got, "export the database again, or choose another noise model")
+def malformed(path: Path, wanted: str, got: str) -> MalformedFileError:
+    """Return the error of a database that is not as COLMAP writes it."""
+    return MalformedFileError(str(path), None, wanted, got, "export the database again, or do without it")

@@ -1,18 +1,23 @@
 """A SQLite database that is read and not obeyed: plain tables only, bounded work, nothing of its schema is run.
 
 A database may be hostile: views without end, virtual tables, generated columns, functions in its schema, or blobs of
-gigabytes. Its schema is not trusted, an authorizer allows reading two tables and nothing else, and the number of steps
-of SQLite's machine is bounded by the size of the file.
+gigabytes. Its schema is not trusted, an authorizer allows reading a few tables and nothing else, and the number of
+steps of SQLite's machine is bounded by the size of the file.
 """
 
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
-TABLES: Final = {"images": ("image_id", "name"), "keypoints": ("image_id", "rows", "cols", "data")}
-"""What is read: columns by table."""
+Tables: TypeAlias = Mapping[str, tuple[str, ...]]
+"""Columns by table."""
+TABLES: Final[Tables] = {"images": ("image_id", "name"), "keypoints": ("image_id", "rows", "cols", "data")}
+"""What is read of keypoints."""
+PAIR_TABLES: Final[Tables] = {**TABLES, "two_view_geometries": ("pair_id", "rows", "cols", "data", "config")}
+"""What is read of verified pairs."""
 
 _STEPS: Final = (10_000_000, 16)  # of SQLite's machine: this many, and so many per byte of the file
 _STEPS_PER_CALL: Final = 10_000
@@ -20,13 +25,13 @@ _SETTINGS: Final = ("trusted_schema = OFF", "query_only = ON", "cell_size_check 
 _MAX_COLUMNS: Final = 100
 
 
-def open_database(path: Path) -> sqlite3.Connection:
-    """Open a database for reading `TABLES` alone; nothing is written, not even a lock.
+def open_database(path: Path, tables: Tables = TABLES) -> sqlite3.Connection:
+    """Open a database for reading ``tables`` alone; nothing is written, not even a lock.
 
     Raises
     ------
     sqlite3.Error
-        It is no database, or one of `TABLES` is no plain table with the columns needed.
+        It is no database, or one of ``tables`` is no plain table with the columns needed.
     """
     size = path.stat().st_size
     db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
@@ -38,9 +43,9 @@ def open_database(path: Path) -> sqlite3.Connection:
             db.execute(f"PRAGMA {setting}")
         budget = _Budget(_STEPS[0] + _STEPS[1] * size)
         db.set_progress_handler(budget.spend, _STEPS_PER_CALL)
-        for table, columns in TABLES.items():
+        for table, columns in tables.items():
             _check_table(db, table, columns)
-        db.set_authorizer(_allow_reading)
+        db.set_authorizer(_Reading(tables))
     except BaseException:
         db.close()
         raise
@@ -74,15 +79,20 @@ def _check_table(db: sqlite3.Connection, table: str, columns: tuple[str, ...]) -
             raise sqlite3.DatabaseError(f"column {column} of table {table} is generated")
 
 
-def _allow_reading(
-    action: int, table: str | None, column: str | None, _database: str | None, source: str | None
-) -> int:
-    """Allow SELECT from the columns of `TABLES`, asked by this program and not by a view or trigger."""
-    if source is not None:
+class _Reading:
+    """The authorizer: SELECT from the columns of some tables, asked by this program, not by a view or trigger."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+
+    def __call__(self, *asked: object) -> int:
+        """Say whether SQLite may do this: action, table, column, database, view or trigger that asks."""
+        action, table, column, _, source = asked
+        if source is not None:
+            return sqlite3.SQLITE_DENY
+        if action == sqlite3.SQLITE_SELECT:
+            return sqlite3.SQLITE_OK
+        columns = self._tables.get(table) if isinstance(table, str) else None
+        if action == sqlite3.SQLITE_READ and columns is not None and column in {*columns, "ROWID", "rowid", ""}:
+            return sqlite3.SQLITE_OK
         return sqlite3.SQLITE_DENY
-    if action == sqlite3.SQLITE_SELECT:
-        return sqlite3.SQLITE_OK
-    known = (*TABLES.get(table or "", ()), "ROWID", "rowid", "")
-    if action == sqlite3.SQLITE_READ and table in TABLES and column in known:
-        return sqlite3.SQLITE_OK
-    return sqlite3.SQLITE_DENY

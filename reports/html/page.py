@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -23,6 +24,7 @@ from sfm_audit.reports.html.svg import to_svg
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.explain import LIMITS, plain_reason
 from sfm_audit.reports.text.reasons import reasons_of
+from sfm_audit.reports.text.witnesses import witnesses_line
 from sfm_audit.reports.text.wording import counted, number, plain, px
 
 _PANEL_ONLY: Final = (
@@ -108,12 +110,19 @@ def render_page(page: PageInput) -> str:
         num_rows=len(content.rows),
         findings=_findings(content),
         failures=[plain(item["message"]) for item in content.run.info.get("failures", [])],
-        limits=LIMITS,
+        limits=(*LIMITS, _witnesses(content)),
         payload=_payload(content, len(page.pictures)),
         style=Markup(_asset("page.css")),  # noqa: S704 - our own files
         script=Markup(_asset("page.js")),  # noqa: S704
         table_library=Markup(_asset("vendor/dataTables.min.js")),  # noqa: S704
     )
+
+
+def _witnesses(content: RunContent) -> str:
+    """Say which witnesses outside of the images were asked, and of how many images they could say something."""
+    asked = Counter(name for row in content.models for name in row["witnesses"] or [])
+    num_spoken_of = sum(content.counts[Member.OUTSIDE].values()) if Member.OUTSIDE in content.counts else 0
+    return witnesses_line(asked, len(content.models), content.num_images, num_spoken_of)
 
 
 def _breakable(name: str) -> Markup:

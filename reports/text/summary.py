@@ -15,6 +15,7 @@ from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, SEVERITY
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
 from sfm_audit.reports.text.reasons import reasons_part
+from sfm_audit.reports.text.witnesses import witnesses_line
 from sfm_audit.reports.text.wording import (
     MISSING,
     counted,
@@ -35,7 +36,7 @@ VERDICT_STYLE: Final[dict[str, str]] = {
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "num_accepted", "num_rejected", "num_undetermined"),
     *("stored_error_px", "recomputed_observation_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
-    "num_nonstationary_images",
+    *("num_nonstationary_images", "witnesses"),
     *(f"num_{verdict}_{member.short}" for member in Member for verdict in Verdict),
 )
 IMAGE_COLUMNS: Final = (
@@ -97,13 +98,15 @@ class _Found:
 class _Models:
     """What the page needs of the table of models, which may be long: sums, and a few rows.
 
-    sums: of the counting columns.    first, worst: rows by name, and by share of rejected images.
+    sums: of the counting columns.    witnesses: in how many models each was asked.
+    first, worst: rows by name, and by share of rejected images.
     """
 
     num_models: int = 0
     datasets: set[str] = field(default_factory=set)
     sums: Counter[str] = field(default_factory=Counter)
     num_stale: int = 0
+    witnesses: Counter[str] = field(default_factory=Counter)
     findings: dict[str, _Found] = field(default_factory=dict)
     first: _Smallest = field(default_factory=lambda: _Smallest(MAX_MODELS, _model_order))
     worst: _Smallest = field(
@@ -118,6 +121,7 @@ class _Models:
             models.num_models += 1
             models.datasets.add(row["dataset"])
             models.sums.update({name: row[name] or 0 for name in MODEL_COLUMNS if name.startswith("num_")})
+            models.witnesses.update(row["witnesses"] or [])
             models.num_stale += (row["share_stale_point_errors"] or 0) > STALE_SHARE
             models.first.add(row)
             models.worst.add(row)
@@ -287,7 +291,7 @@ def _closing(run: RunReader, models: _Models, page: Page) -> list[str]:
     )
     verdicts = f"{accepted} accepted, {rejected} rejected, {undetermined} undetermined"
     lines = [f"{counted(total, 'image')}: {verdicts}."]
-    lines += [paragraph(f"- {text}", page.width, "  ") for text in CAVEATS]
+    lines += [paragraph(f"- {text}", page.width, "  ") for text in (*CAVEATS, _witnesses(models))]
     stale = models.num_stale
     steps = []
     if stale:
@@ -308,6 +312,11 @@ def _closing(run: RunReader, models: _Models, page: Page) -> list[str]:
         f'All numbers: pandas.read_parquet("{folder}/images"), "{folder}/models"; docs/tables.md explains the columns'
     )
     return ["\n".join(lines), "\n".join(["Next", *(paragraph(f"- {step}", page.width, "  ") for step in steps)])]
+
+
+def _witnesses(models: _Models) -> str:
+    num_spoken_of = sum(models.sums[f"num_{verdict}_{Member.OUTSIDE.short}"] for verdict in Verdict)
+    return witnesses_line(models.witnesses, models.num_models, models.sums["num_images"], num_spoken_of)
 
 
 def _model_order(row: Row) -> Any:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from joint_reference import SPEC, model_of, with_poses
+from joint_reference import SPEC, model_of, with_poses, with_rig
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -17,19 +17,6 @@ from sfm_audit.audit.joint import audit_jointly
 from sfm_audit.loaders.model import rotation_from_quat
 
 PAIRS = dataclasses.replace(SPEC, num_images=8)
-
-
-def with_rig(model):
-    """Images 2k and 2k + 1 as one frame, the first of them at the rig's origin."""
-    quat, shift = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
-    poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(quat), 1))
-    turned = Rotation.from_quat(np.roll(quat, -1, axis=1))
-    second = turned[1::2] * turned[::2].inv()
-    poses[1::2, :4] = np.roll(second.as_quat(), 1, axis=1)
-    poses[1::2, 4:] = shift[1::2] - second.apply(shift[::2])
-    frame_idx = np.arange(len(quat)) // 2
-    images = dataclasses.replace(model.images, frame_idx=frame_idx, pose_cam_from_rig=poses)
-    return dataclasses.replace(model, images=images)
 
 
 def with_moved_frame(model, frame, rotation, translation):

@@ -1,0 +1,147 @@
+"""Which images share how many points, and in how many parts does the model hang together? (method.md section 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.loaders.arrays import BoolArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covisibility:
+    """Pairs of images that share points, each once: first < second (k,), num_shared (k,) points; num_images."""
+
+    first: IntArray
+    second: IntArray
+    num_shared: IntArray
+    num_images: int
+
+    def at_least(self, num: int) -> Covisibility:
+        """Return the pairs that share so many points."""
+        kept = self.num_shared >= num
+        return Covisibility(self.first[kept], self.second[kept], self.num_shared[kept], self.num_images)
+
+    def degree(self) -> IntArray:
+        """Return (I,) number of neighbours."""
+        both = np.concatenate([self.first, self.second])
+        return np.bincount(both, minlength=self.num_images).astype(np.int64)
+
+    def strongest(self) -> IntArray:
+        """Return (I,) points shared with the strongest neighbour, 0 without any."""
+        out = np.zeros(self.num_images, dtype=np.int64)
+        np.maximum.at(out, self.first, self.num_shared)
+        np.maximum.at(out, self.second, self.num_shared)
+        return out
+
+    def components(self) -> IntArray:
+        """Return (I,) which part each image is in; 0 is the largest."""
+        ones = np.ones(len(self.first), dtype=np.int8)
+        graph = coo_array((ones, (self.first, self.second)), shape=(self.num_images, self.num_images))
+        labels = connected_components(graph, directed=False)[1]
+        order = np.argsort(-np.bincount(labels, minlength=1), kind="stable")
+        rank = np.empty(len(order), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        return np.asarray(rank[labels], dtype=np.int64) if self.num_images else np.empty(0, np.int64)
+
+    def shares(self, image_idx: IntArray, num: int) -> BoolArray:
+        """Whether the images of each pair (k, 2) share at least ``num`` points."""
+        kept = self.at_least(num)
+        known = np.sort(kept.first * self.num_images + kept.second)
+        low, high = image_idx.min(axis=1, initial=self.num_images), image_idx.max(axis=1, initial=0)
+        return np.isin(low * self.num_images + high, known)
+
+
+def covisibility(residuals: ModelResiduals, num_points: int) -> Covisibility:
+    """Count the shared points of all pairs of images, over their inliers; a point seen twice counts once."""
+    num_images = len(residuals.offsets) - 1
+    image_idx = np.repeat(np.arange(num_images), np.diff(residuals.offsets))
+    shape = (num_images, max(num_points, 1))
+    sees = csr_array((np.ones(len(image_idx), dtype=np.int32), (image_idx, residuals.point_idx)), shape=shape)
+    sees.sum_duplicates()
+    sees.data[:] = 1
+    shared = (sees @ sees.T).tocoo()
+    upper = shared.row < shared.col
+    return Covisibility(
+        shared.row[upper].astype(np.int64),
+        shared.col[upper].astype(np.int64),
+        shared.data[upper].astype(np.int64),
+        num_images,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cuts:
+    """Where a graph hangs by one edge or one vertex: bridges (b, 2), and articulation (I,) vertices."""
+
+    bridges: IntArray
+    articulation: BoolArray
+
+
+def cuts_of(graph: Covisibility) -> Cuts:
+    """Return bridges and articulation vertices, by Tarjan's depth-first search."""
+    search = _Search(graph)
+    for root in range(graph.num_images):
+        search.run(root)
+    bridges = np.array(sorted(search.bridges), dtype=np.int64).reshape(-1, 2)
+    return Cuts(bridges, np.array(search.articulation, dtype=bool))
+
+
+class _Search:
+    """Depth-first search without recursion: `order` of the visit, `low`est order reached from below."""
+
+    def __init__(self, graph: Covisibility) -> None:
+        self._graph = graph
+        n = graph.num_images
+        self.order, self.low = [-1] * n, [0] * n
+        self.articulation = [False] * n
+        self.bridges: list[tuple[int, int]] = []
+        self._num_visited = 0
+
+    @cached_property
+    def _neighbours(self) -> list[list[int]]:
+        graph = self._graph
+        ends = np.concatenate([graph.first, graph.second]), np.concatenate([graph.second, graph.first])
+        by_start = np.argsort(ends[0], kind="stable")
+        offsets = np.concatenate([[0], np.cumsum(np.bincount(ends[0], minlength=graph.num_images))]).tolist()
+        others = ends[1][by_start].tolist()
+        return [others[first:last] for first, last in pairwise(offsets)]
+
+    def run(self, root: int) -> None:
+        """Visit what can be reached from ``root``."""
+        if self.order[root] >= 0:
+            return
+        self._enter(root)
+        path = [(root, -1, iter(self._neighbours[root]))]
+        num_children = 0
+        while path:
+            at, parent, rest = path[-1]
+            following = next(rest, None)
+            if following is None:
+                path.pop()
+                if parent >= 0:
+                    self._leave(at, parent, is_root=parent == root)
+                    num_children += parent == root
+            elif self.order[following] < 0:
+                self._enter(following)
+                path.append((following, at, iter(self._neighbours[following])))
+            elif following != parent:
+                self.low[at] = min(self.low[at], self.order[following])
+        self.articulation[root] = num_children > 1
+
+    def _enter(self, at: int) -> None:
+        self.order[at] = self.low[at] = self._num_visited
+        self._num_visited += 1
+
+    def _leave(self, at: int, parent: int, *, is_root: bool) -> None:
+        self.low[parent] = min(self.low[parent], self.low[at])
+        if self.low[at] > self.order[parent]:
+            self.bridges.append((min(at, parent), max(at, parent)))
+        if self.low[at] >= self.order[parent] and not is_root:
+            self.articulation[parent] = True
