@@ -60,6 +60,16 @@ MODELS = {
     "a fifth behind": ([image(known=False, num_linked=10, share=0.8)] * 5, []),
     "more behind": ([image(known=False, num_linked=10, share=0.7)] * 5, [(PARTS, 15, Cause.POSES_OR_POINTS)]),
     "all behind": ([image(known=False, num_linked=10, share=0.0)] * 5, [(BEHIND, 50, Cause.POSES_OR_POINTS)]),
+    "20 are enough to say behind": (
+        [image(known=False, num_linked=20, share=0.0)],
+        [(BEHIND, 20, Cause.POSES_OR_POINTS)],
+    ),
+    "20 are enough to disagree": ([image(known=False, num_linked=20, share=0.7)], [(PARTS, 6, Cause.POSES_OR_POINTS)]),
+    "half of the images say scale": (
+        [image(Cause.POINT_SCALE)] * 2 + [image()] * 2,
+        [(PARTS, 2, Cause.POSES_OR_POINTS)],
+    ),
+    "more of them do": ([image(Cause.POINT_SCALE)] * 3 + [image()] * 2, [(PARTS, 3, Cause.POINT_SCALE)]),
     "too few to say": ([image(known=False, num_linked=4, share=0.0)] * 4, []),
     "no points": ([image(known=False, num_linked=0, share=np.nan)] * 4, []),
 }
@@ -167,6 +177,56 @@ def test_half_a_pixel_has_to_be_known_to_five_sd_and_not_to_be_zero():
     assert consistency(xyz, exact + 0.5 + 1e-3).half_pixel == 1
     stretched = (exact - exact.mean(axis=0)) * 1.002 + exact.mean(axis=0)
     assert consistency(xyz, stretched + 0.5).half_pixel == 0
+    shrunk = (exact - exact.mean(axis=0)) * 0.998 + exact.mean(axis=0)
+    assert consistency(xyz, shrunk + 0.5).half_pixel == 0
+
+
+def test_what_fits_has_no_explanation():
+    xyz, xy = scene(0)
+    found = consistency(xyz, xy)
+    assert (found.inconsistent, found.moved, found.explanation) == (False, False, None)
+
+
+@pytest.mark.parametrize(("rest_px", "inconsistent"), [(2.0, True), (4.5, False)])
+def test_an_error_below_one_percent_of_the_width_counts_from_20_times_what_an_affine_map_leaves(rest_px, inconsistent):
+    """Some 60 px at a width of 16000 px: no pose stretches one axis and shrinks the other."""
+    camera = dataclasses.replace(CAMERA, width=16000, height=12000, params=np.array([10000.0, 8000.0, 6000.0]))
+    xyz, _ = scene(7, n=400)
+    rng = np.random.default_rng(7)
+    exact = project(camera.model, camera.params, xyz)
+    inside = (np.abs(exact - camera.params[1:]) < [8000, 6000]).all(axis=1)
+    observed = exact + (exact - camera.params[1:]) * [0.02, -0.02] + rng.normal(size=exact.shape) * rest_px / np.sqrt(2)
+    found = consistency(xyz[inside], observed[inside], camera=camera)
+    assert 20 < found.rms_px < 160
+    assert found.inconsistent is inconsistent
+
+
+def test_a_sphere_is_inconsistent_above_one_percent_of_its_width_alone():
+    xyz, _ = scene(0)
+    sphere = CameraRecord(1, BY_NAME["EQUIRECTANGULAR"], 8000, 4000, np.array([8000.0, 4000.0]))
+    xy = project(sphere.model, sphere.params, xyz)
+    rng = np.random.default_rng(0)
+    for sd_px, inconsistent in ((40.0, False), (80.0, True)):
+        found = consistency(xyz, xy + sd_px * rng.normal(size=xy.shape), camera=sphere)
+        assert found.stored_rms_px > 50
+        assert found.inconsistent is inconsistent
+
+
+def test_points_behind_are_no_matter_of_the_pose_s_step():
+    xyz, xy = scene(3)
+    world = xyz - [0, 0, 7]
+    world[:60, 2] -= 20  # 30 % behind
+    found = consistency(world, xy, turn=(0, 0.06, 0), translation=(0, 0, 7))
+    assert found.stored_rms_px > 16
+    assert (found.inconsistent, found.moved) == (True, False)
+
+
+def test_exactly_a_fifth_of_the_links_may_be_wrong():
+    xyz, xy = scene(4, n=200, noise=0.1)
+    xy[:40] += 500
+    assert consistency(xyz, xy).inconsistent is False
+    xy[40] += 500
+    assert consistency(xyz, xy).inconsistent is True
 
 
 def test_a_sphere_has_no_half_pixel():

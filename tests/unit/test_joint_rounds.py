@@ -118,7 +118,7 @@ def test_the_admitted_group_is_the_largest_significant_one(monkeypatch):
         0.3, G.SMOOTH, rolling_shutter=GroupTest(1e-9, 0.5, 1.0, 6, S.TESTED), affine=NOTHING._replace(px=9.0)
     )
     rounds = Rounds(monkeypatch, [{G(group): test for group, test in tests.items()}, QUIET, QUIET])
-    rounds.run()
+    assert rounds.run().effect_px.tolist() == [0.5, 0.0, 0.0]
     assert rounds.included == [[(0, GROUP_COLUMNS[G.ROLLING_SHUTTER].stop - GROUP_COLUMNS[G.ROLLING_SHUTTER].start)]]
 
 
@@ -269,6 +269,33 @@ def test_what_cannot_be_tested_says_why():
     for meat in (np.ones((2, 2)), np.zeros((2, 2)), np.full((2, 2), NAN), np.diag([1.0, 0.0])):
         assert hotelling(scores(), meat=meat).status is S.SINGULAR
     assert math.isnan(hotelling(scores(), meat=np.ones((2, 2))).p)
+    assert hotelling(scores(gram=np.array([[80.0, 0.0], [0.0, NAN]])), root=np.eye(2)) == untested(S.NOT_FINITE)
+
+
+@pytest.mark.parametrize(("below_one", "status"), [(1e-13, S.SINGULAR), (1e-9, S.TESTED)])
+def test_tracks_that_all_but_agree_are_singular(below_one, status):
+    correlation = math.sqrt(1 - below_one)
+    for unit in (1.0, 1e16):  # whatever the fields' unit
+        meat = np.array([[1.0, correlation], [correlation, 1.0]]) * unit
+        assert hotelling(scores(), meat=meat, root=np.eye(2)).status is status
+
+
+def test_a_group_is_tested_by_itself_whatever_the_others_hold():
+    """Three columns of which the last two are the group: not finite ones beside them change nothing."""
+    alone = scores()
+    wide = replace(
+        alone,
+        sq_length=np.array([NAN, 80.0, 80.0]),
+        gram=np.block([[np.full((1, 1), NAN), np.full((1, 2), NAN)], [np.full((2, 1), NAN), alone.gram]]),
+        score=np.array([NAN, *alone.score]),
+        track_score=np.column_stack([np.full(60, NAN), alone.track_score]),
+    )
+    own = slice(1, 3)
+    root = group_root(wide, own)
+    np.testing.assert_array_equal(root, group_root(alone, slice(0, 2)))
+    meat = np.full((3, 3), NAN)
+    meat[1:, 1:] = alone.track_score.T @ alone.track_score
+    assert group_test.test_group(wide, meat, own, root, sigma_px=0.5, rms_px=9.0) == hotelling(alone)
 
 
 @pytest.mark.parametrize(("kept", "rank"), [(1.001e-4, 2), (0.999e-4, 1)])
