@@ -64,6 +64,7 @@ def test_a_bound_on_nothing_holds():
 def misfits(**changes):
     row = {f"misfit_{group}_px_joint": 0.0 for group in GROUPS} | {f"misfit_{group}_q_joint": 0.5 for group in GROUPS}
     row |= {"misfit_smooth_px_joint": 0.3, "misfit_smooth_q_joint": 0.01, "misfit_group": "smooth"}
+    row |= {"misfit_px": 0.3}
     row |= {"misfit_worth_deg": 0.0, "misfit_worth_centre": 0.0, "misfit_worth_focal_rel": 0.0}
     return pd.DataFrame([row | changes])
 
@@ -93,6 +94,8 @@ def test_a_misfit_counts_when_it_is_there_and_worth_something(changes, rejected)
         ({"misfit_worth_deg": 0.02}, True),
         ({"misfit_worth_deg": 1.0, "misfit_group": "tangential"}, False),
         ({"misfit_worth_deg": 1.0, "misfit_group": None}, False),
+        ({"misfit_px": 0.4}, False),
+        ({"misfit_px": 0.401}, True),
         ({"misfit_worth_deg": np.nan}, True),
     ],
 )
