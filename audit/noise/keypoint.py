@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.fits import fit_variance
@@ -163,6 +163,8 @@ def fit_scale_power(
     )
     if not sums.residuals_px.any():
         return ScalePower(math.nan, math.nan, len(tracks))
+    from scipy import optimize  # noqa: PLC0415 - a tenth of a second that the other noise models need not wait for
+
     found = optimize.minimize_scalar(
         lambda gamma: -sums.profile(float(gamma)), bounds=GAMMA_RANGE, method="bounded", options={"xatol": _TOLERANCE}
     )
@@ -235,6 +237,8 @@ def _best_prior(sum_sq: FloatArray, dof: FloatArray) -> float:
     start = np.log([4.0, 4.0 * pooled])
     low, high = NU0_RANGE
     bounds = [(math.log(low), math.log(high)), (float(start[1]) - 30.0, float(start[1]) + 30.0)]
+    from scipy import optimize  # noqa: PLC0415 - as above
+
     return -float(optimize.minimize(minus, start, method="L-BFGS-B", bounds=bounds).fun)
 
 
