@@ -5,12 +5,16 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
+
+import click
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.progress import Progress
@@ -130,7 +134,16 @@ def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure]
         problems[:] = [*before, *map(as_said, failures)]
         # a PATH that is not there today, such as a disk that is not mounted, does not cost the tables made from it
         keep = None if found.errors else [ref.key for ref in found.refs]
-        store.finish(keep, problems, time.perf_counter() - start)
+        store.finish(keep, problems, time.perf_counter() - start, _told())
+
+
+def _told() -> dict[str, str]:
+    """Return when this is, and the command that the user gave; people read it on the page."""
+    told = {"finished": datetime.now(UTC).isoformat(timespec="seconds")}
+    context = click.get_current_context(silent=True)
+    if context is not None and isinstance(context.obj, tuple):
+        told["command"] = shlex.join(["sfm-audit", *context.obj])
+    return told
 
 
 def _paths_without_models(paths: Sequence[str], found: Discovery) -> frozenset[str]:

@@ -29,7 +29,7 @@ from sfm_audit.loaders.correspondences.scan_ptx import read_ptx
 from sfm_audit.loaders.correspondences.table import read_correspondences
 from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileError
 from sfm_audit.reports import figures
-from sfm_audit.reports.figures import Residuals
+from sfm_audit.reports.charts import Residuals
 
 CALIBRATION_FILE: Final = "calibration.parquet"
 RESIDUALS_FILE: Final = "residuals.parquet"

@@ -18,7 +18,7 @@ from sfm_audit.audit.misfit import MisfitGroup, prepare_image
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.reports import figures
-from sfm_audit.reports.figures import CAPTIONS, Residuals
+from sfm_audit.reports.charts import CAPTIONS, Residuals
 from sfm_audit.reports.text.explain import Story, render_story, strongest_where
 
 

@@ -69,7 +69,7 @@ def cli() -> None:
 def main(args: Sequence[str]) -> int:
     """Run one command and return its exit code; errors nobody expected keep their traceback."""
     try:
-        code = cli.main(list(args) or ["--help"], prog_name="sfm-audit", standalone_mode=False)
+        code = cli.main(list(args) or ["--help"], prog_name="sfm-audit", standalone_mode=False, obj=tuple(args))
     except KnownError as error:
         return _refuse(str(error), error.exit_code)
     except click.Abort:

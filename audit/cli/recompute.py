@@ -17,8 +17,8 @@ from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
 from sfm_audit.loaders.formats import keypoint_scales_of
 from sfm_audit.loaders.paths.locations import RemotePath, parse_location
-from sfm_audit.reports.figures import ResidualError, Residuals
-from sfm_audit.reports.figures.residuals import principal_point, residuals_of_row
+from sfm_audit.reports.charts import ResidualError, Residuals
+from sfm_audit.reports.charts.residuals import principal_point, residuals_of_row
 from sfm_audit.reports.run_folder.reader import RunReader
 
 _OTHER_MACHINES: Final = ("//", "\\\\")  # opening such a path sends the user's name to a host, on Windows
@@ -54,6 +54,31 @@ class ResidualSource:
         if not len(found):
             raise ResidualError(f"{row['model_path']}: holds no image of id {row['image_id']} any more")
         return image_residuals_of(auditor, int(found[0]), row)
+
+    def pooled(self, row: Mapping[str, Any]) -> Residuals:
+        """Return the residuals of all images of the camera in a row of ``RUN/cameras`` that knows its ``part``.
+
+        Errors as of `residuals`.
+        """
+        size_px = (row["width"], row["height"]) if row["width"] else None
+        if self._run.has_part("observations", row["part"]):
+            names = ("x_px", "y_px", "residual_x_px", "residual_y_px")
+            return Residuals.from_table(self._run.rows_of_camera(row["part"], row["camera_id"], names), size_px=size_px)
+        auditor = self._auditor(row["model_path"])
+        model, residuals = auditor.model, auditor.residuals
+        mine = np.repeat(model.images.camera_id == row["camera_id"], np.diff(residuals.offsets))
+        xy_px = model.observations.xy_px[residuals.observation_row[mine]]
+        return Residuals.build(xy_px, residuals.residuals_px[:, mine].T, size_px=size_px)
+
+    def model(self, model_path: str) -> SparseModel:
+        """Return a model as it lies where the run read it, with the files that the run read.
+
+        Raises
+        ------
+        ResidualError
+            It cannot be read, or is another one now; one line says why.
+        """
+        return self._auditor(model_path).model
 
     def _auditor(self, model_path: str) -> ModelAuditor:
         if self._last is None or self._last[0] != model_path:

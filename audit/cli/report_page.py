@@ -1,21 +1,27 @@
-"""The page of ``sfm-audit report``: run folder, residuals and photos brought together. Imports matplotlib."""
+"""The page of ``sfm-audit report``: run folder, models and photos brought together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 import pyarrow as pa
 from tqdm import tqdm
 
+from sfm_audit.audit.cli.model_source import scene_view
 from sfm_audit.audit.cli.recompute import ResidualSource, tau_px
 from sfm_audit.reports import html
+from sfm_audit.reports.charts import ResidualError
 from sfm_audit.reports.errors import RunFolderError
-from sfm_audit.reports.figures import ResidualError
-from sfm_audit.reports.html.photos import find_photo, read_photo
+from sfm_audit.reports.html.photos import PHOTO, THUMBNAIL, find_photo, photo_urls
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.wording import plain
+
+_MAX_FIELDS: Final = 12  # cameras whose residuals are drawn
+_MAX_THUMBNAILS: Final = 100  # rows with a small photo
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +46,78 @@ def make_page(run: RunReader, photos: Path | None, worst: int, named: Sequence[s
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:  # a column or a word of another version
         what = f"its tables cannot be read ({' '.join(str(error).split())[:200]})"
         raise RunFolderError(run.folder, what, "audit again into a new folder") from error
-    source = ResidualSource(run, named)
-    rows = content.rows[:worst]
-    pictures = [html.ImagePictures()] * len(rows)
-    # models are opened one after the other, each once, whatever the order of the images on the page
-    for i in tqdm(sorted(range(len(rows)), key=lambda i: rows[i]["model_path"]), unit="image", disable=silent):
-        pictures[i] = _pictures(f"worst-{i}", rows[i], source, photos, content)
-    no_photos = None if photos else "Name the folder of the photos with --images to see the inliers on them."
-    text = html.render_page(html.PageInput(content, pictures, no_photos))
-    return Made(text, content.num_images, sum(bool(item.pictures) for item in pictures))
-
-
-def _pictures(
-    key: str, row: Row, source: ResidualSource, photos: Path | None, content: html.RunContent
-) -> html.ImagePictures:
-    try:
-        residuals = source.residuals(row)
-    except ResidualError as error:
-        return html.ImagePictures(missing=f"No pictures: {plain(str(error))}.")
-    path = find_photo(photos, row) if photos else None
-    photo = read_photo(path) if path else None
-    return html.draw_image(
-        key,
-        residuals,
-        row,
-        photo=photo,
-        tau_px=tau_px(content.config, row["sigma_constant_px"]),
-        alpha=float(content.config.get("alpha", 0.05)),
-        missing="No photo of this name in the folder of --images." if photos and photo is None else None,
+    made = _Drawing(content, ResidualSource(run, named), photos)
+    made.draw(worst, silent=silent)
+    text = html.render_page(
+        html.PageInput(
+            content,
+            [made.pictures[i] for i in range(len(made.pictures))],
+            None if photos else "Name the folder of the photos with --images to see the inliers on them.",
+            [made.thumbnails.get(i) for i in range(min(len(content.rows), _MAX_THUMBNAILS))] if photos else [],
+            made.fields,
+            [made.views[i] for i in range(len(made.views))],
+        )
     )
+    return Made(text, content.num_images, sum(bool(item.pictures) for item in made.pictures.values()))
+
+
+class _Drawing:
+    """What was drawn so far, by position on the page."""
+
+    def __init__(self, content: html.RunContent, source: ResidualSource, photos: Path | None) -> None:
+        self.pictures: dict[int, html.ImagePictures] = {}
+        self.fields: dict[int, html.Picture | str] = {}
+        self.views: dict[int, html.ModelView] = {}
+        self.thumbnails: dict[int, str] = {}
+        self._content, self._source, self._photos = content, source, photos
+
+    def draw(self, worst: int, *, silent: bool) -> None:
+        """Draw everything that needs a model or a photo; models are opened one after the other, each once."""
+        rows, cameras = self._content.rows, self._content.cameras
+        tasks: list[tuple[str, Callable[[], object]]] = []
+        for i, (part, path, title) in enumerate(html.chosen_models(rows)):
+            tasks.append((path, partial(self._view, i, part, path, title)))
+        tasks += [(row["model_path"], partial(self._field, i, row)) for i, row in enumerate(cameras[:_MAX_FIELDS])]
+        tasks += [(row["model_path"], partial(self._image, i, row)) for i, row in enumerate(rows[:worst])]
+        if self._photos is not None:
+            small = enumerate(rows[worst:_MAX_THUMBNAILS], start=worst)
+            tasks += [(row["model_path"], partial(self._thumbnail, i, row)) for i, row in small]
+        for _, task in tqdm(sorted(tasks, key=lambda item: item[0]), unit="drawing", disable=silent):
+            task()
+
+    def _view(self, i: int, part: str, path: str, title: str) -> None:
+        try:
+            self.views[i] = html.ModelView(part, title, scene_view(self._source.model(path)))
+        except ResidualError as error:
+            self.views[i] = html.ModelView(part, title, None, f"No view: {plain(str(error))}.")
+
+    def _field(self, i: int, row: Row) -> None:
+        try:
+            self.fields[i] = html.draw_camera_field(self._source.pooled(row), row["camera_id"])
+        except ResidualError as error:
+            self.fields[i] = f"No residual field: {plain(str(error))}."
+
+    def _image(self, i: int, row: Row) -> None:
+        url = self._thumbnail(i, row, PHOTO)
+        try:
+            residuals = self._source.residuals(row)
+        except ResidualError as error:
+            self.pictures[i] = html.ImagePictures(missing=f"No pictures: {plain(str(error))}.")
+            return
+        self.pictures[i] = html.draw_image(
+            residuals,
+            row,
+            photo_url=url,
+            tau_px=tau_px(self._content.config, row["sigma_constant_px"]),
+            alpha=float(self._content.config.get("alpha", 0.05)),
+            missing="No photo of this name in the folder of --images." if self._photos and url is None else None,
+        )
+
+    def _thumbnail(self, i: int, row: Row, *larger: int) -> str | None:
+        """Read the photo of a row, keep it small, and return it in the largest size."""
+        path = find_photo(self._photos, row) if self._photos else None
+        urls = photo_urls(path, *larger, THUMBNAIL) if path else None
+        if urls is None:
+            return None
+        self.thumbnails[i] = urls[-1]
+        return urls[0]

@@ -282,6 +282,8 @@ def camera_row(
         **cause_columns(audit.misfit),
         "advised_camera_model": audit.advised_camera_model,
         **own_columns(own_diagnostics(step, math.nan) if step else None),
+        "own_parameters": list(step.names) if step else None,
+        "own_correlations": step.correlation[np.tril_indices(len(step.names), -1)] if step else None,
         **{name: implied.get(name, math.nan) for name in (*IMPLIED, *(f"{name}_sd" for name in IMPLIED))},
         "sd_focal_rel_joint": step.sd_focal_rel if step else math.nan,
         "joint_blocks": joint.num_blocks if joint else None,

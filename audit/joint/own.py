@@ -31,6 +31,7 @@ class CameraStep:
     sd_focal_rel: sd_f / |f|, of both focal lengths together where there are two (see `_sd_focal_rel`); NaN where one is
     not identified or there is none.
     focal_identified: whether all focal lengths are.
+    correlation: (q, q) of the estimates, from the covariance behind ``sd``; NaN where one is not identified.
     """
 
     camera_idx: int
@@ -46,6 +47,7 @@ class CameraStep:
     sd_focal_rel: float
     focal_identified: bool
     implied: FloatArray
+    correlation: FloatArray
 
     def is_material(self, tau_px: float) -> bool:
         """Whether both steps gain more than tau and a parameter moves by more than 5 sd in both.
@@ -126,7 +128,16 @@ def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -
         _implied(
             system, images, camera.params[params] + step, [params.index(i) for i in camera.model.focal_idxs], step
         ),
+        _correlation(covariance, sd),
     )
+
+
+def _correlation(covariance: FloatArray, sd: FloatArray) -> FloatArray:
+    """Return the correlations (q, q) of a covariance, NaN where a standard deviation is not known or zero."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scaled = covariance / sd / sd[:, None]
+    known = (sd > 0) & np.isfinite(sd)
+    return np.where(known & known[:, None], scaled, math.nan)
 
 
 def _sd_focal_rel(covariance: FloatArray, focals: FloatArray) -> float:

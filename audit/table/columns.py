@@ -241,6 +241,13 @@ CAMERAS: Final[tuple[Column, ...]] = (
     count("num_observations", "their inliers"),
     *misfit(),
     *_own_steps(),
+    texts("own_parameters", "its own parameters, those that COLMAP refines; null where it takes no part"),
+    Column(
+        "own_correlations",
+        list_of(pa.float64()),
+        "1",
+        "correlations of own_parameters in the joint system, below the diagonal, row by row",
+    ),
     *(number(f"{name}_sd", f"standard deviation of {name}") for name in IMPLIED),
     number("sd_focal_rel_joint", "largest sd_f / f in the joint system"),
     count("joint_blocks", "blocks in which the joint system was solved; 1: whole"),

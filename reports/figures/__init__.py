@@ -6,10 +6,10 @@ were. Needs the extra ``report``.
 
 from __future__ import annotations
 
+from sfm_audit.reports.charts.captions import CAPTIONS
+from sfm_audit.reports.charts.residuals import ResidualError, Residuals, read_residuals
 from sfm_audit.reports.figures.cameras import expected_error, misfit_groups
-from sfm_audit.reports.figures.captions import CAPTIONS
 from sfm_audit.reports.figures.normality import qq_plot, scale_comparison, standardised_histogram
-from sfm_audit.reports.figures.residuals import ResidualError, Residuals, read_residuals
 from sfm_audit.reports.figures.runs import (
     RunColumns,
     histogram_by_verdict,

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.charts.numbers import MISFIT_GROUPS
 from sfm_audit.reports.figures.style import (
     BLUE,
     COLOUR_BAR,
@@ -23,7 +24,6 @@ from sfm_audit.reports.figures.style import (
 
 _BESIDE: Final[dict[str, Any]] = {"xytext": (3.0, 0.0), "textcoords": "offset points"}
 _TOO_LARGE_PX: Final = 1e100  # nor is NaN below it: axes end at 1e308
-MISFIT_GROUPS: Final = ("radial", "tangential", "affine", "principal_point", "rolling_shutter", "smooth")
 
 
 @styled

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.charts.numbers import MAX_STEPS, bulk, first_text, histogram, log_ticks, tick_label
 from sfm_audit.reports.figures.style import (
     BLUE,
     INK,
@@ -24,9 +24,6 @@ from sfm_audit.reports.figures.style import (
     say_nothing_to_show,
     styled,
 )
-
-_BINS: Final = 40
-_MAX_STEPS: Final = 400
 
 
 class RunColumns(Protocol):
@@ -86,18 +83,14 @@ def histogram_by_verdict(
     marks : thresholds to draw as lines, by name
     """
     figure, axes = new_axes()
-    number = np.asarray(values, dtype=np.float64)
-    verdict = np.asarray(verdicts, dtype=object)
-    usable = np.isfinite(number) & (number > 0 if log else True)
-    if not usable.any():
+    found = histogram(values, verdicts, log=log)
+    if found is None:
         say_nothing_to_show(axes, f"{label}: none computed")
         return figure
-    low, high = _range(number[usable], log=log)
-    edges = np.geomspace(low, high, _BINS + 1) if log else np.linspace(low, high, _BINS + 1)
-    shown = np.clip(number, edges[0], edges[-1])
-    base = np.zeros(_BINS)
+    edges = found.edges
+    base = np.zeros(len(edges) - 1)
     for name, colour in VERDICT_COLOURS.items():
-        height, _ = np.histogram(shown[usable & (verdict == name)], edges)
+        height = found.counts[name]
         look: dict[str, Any] = {
             "color": colour,
             "hatch": VERDICT_HATCHES[name],
@@ -105,25 +98,19 @@ def histogram_by_verdict(
             "linewidth": 0.2,
         }
         axes.bar(edges[:-1], height, np.diff(edges), base, align="edge", label=name, **look)
-        base += height
+        base = base + height
     for name, at in (marks or {}).items():
         axes.axvline(at, color=INK, linewidth=0.8, linestyle="--", label=name)
     if log:
-        _span_decades(axes)
-    missing = int(np.count_nonzero(~usable))
-    axes.set_title(f"{int(usable.sum())} images" + (f", {missing} without the number" if missing else ""))
+        axes.set_xscale("log")
+        axes.xaxis.set_minor_locator(NullLocator())
+        round_values = log_ticks(float(edges[0]), float(edges[-1]))
+        axes.set_xticks(round_values, [tick_label(value) for value in round_values])
+    axes.set_title(f"{found.shown} images" + (f", {found.missing} without the number" if found.missing else ""))
     axes.set_xlabel(label)
     axes.set_ylabel("images")
     figure.legend(loc="outside upper left", ncols=2)
     return figure
-
-
-def _span_decades(axes: Axes) -> None:
-    """Make the axis of values logarithmic, with plain numbers at 1, 2 and 5."""
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
 
 
 @styled
@@ -139,7 +126,7 @@ def noise_comparison(
         if number.size:
             drawn = True
             share = (np.arange(number.size) + 1.0) / number.size
-            step = np.unique(np.linspace(0, number.size - 1, min(number.size, _MAX_STEPS)).astype(np.int64))
+            step = np.unique(np.linspace(0, number.size - 1, min(number.size, MAX_STEPS)).astype(np.int64))
             median = float(np.median(number))
             axes.plot(
                 number[step], 100.0 * share[step], color=colour, linestyle=style, label=f"{name}: median {median:.2g}"
@@ -162,7 +149,7 @@ def ks_comparison(images: RunColumns, *, alpha: float = 0.05) -> Figure:
     A test of the right size follows the diagonal where all images are sound.
     """
     figure, axes = new_axes()
-    name = _first_text(images["noise_model"])
+    name = first_text(images["noise_model"])
     drawn = False
     for column, label, colour, style in (
         ("ks_constant_p", "constant", VERMILION, "--"),
@@ -174,7 +161,7 @@ def ks_comparison(images: RunColumns, *, alpha: float = 0.05) -> Figure:
             continue
         drawn = True
         share = 100.0 * np.arange(p.size + 1) / p.size
-        step = np.unique(np.linspace(0, p.size - 1, min(p.size, _MAX_STEPS)).astype(np.int64))
+        step = np.unique(np.linspace(0, p.size - 1, min(p.size, MAX_STEPS)).astype(np.int64))
         rejected = 100.0 * np.count_nonzero(p < alpha) / p.size
         axes.plot(
             np.concatenate([[0.0], p[step], [1.0]]),
@@ -196,21 +183,7 @@ def ks_comparison(images: RunColumns, *, alpha: float = 0.05) -> Figure:
     return figure
 
 
-def _first_text(values: Any) -> str | None:
-    for value in np.asarray(values, dtype=object)[:1]:
-        return None if value is None else str(value)
-    return None
-
-
-def _range(values: FloatArray, *, log: bool) -> tuple[float, float]:
-    """All but the outer half percent at either side; the outermost bars hold what lies beyond."""
-    low, high = (float(v) for v in np.quantile(values, [0.005, 0.995]))
-    if high > low:
-        return low, high
-    return (low / 2.0, low * 2.0) if log else (low - 0.5, low + 0.5)
-
-
 def _limit_to_bulk(axes: Any, series: Sequence[Any]) -> None:
     values: NDArray[np.float64] = np.concatenate([np.asarray(one, dtype=np.float64) for one in series])
-    low, high = _range(values[np.isfinite(values)], log=False)
+    low, high = bulk(values[np.isfinite(values)], log=False)
     axes.set_xlim(low, high)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Final
 
 import numpy as np
@@ -10,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.reports.figures.residuals import Residuals
+from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.charts.numbers import ARROW_SHARE, cell_means, evenly, magnification, profile, radial_parts
+from sfm_audit.reports.charts.residuals import Residuals
 from sfm_audit.reports.figures.style import (
     BLUE,
     COLOUR_BAR,
@@ -24,8 +24,6 @@ from sfm_audit.reports.figures.style import (
     styled,
 )
 
-_ARROW_SHARE: Final = 0.08  # of the image's longer side, for a long residual (90th percentile)
-_CHI2_99: Final = 9.21  # two degrees of freedom
 _MAX_HEIGHT_IN: Final = 4.2
 _ON_CELLS: Final = "#fdfdfd"  # on coloured cells, whatever the page is like
 _AROUND: Final = "#222222"
@@ -50,7 +48,7 @@ def residual_vectors(
         return figure
     chosen = evenly(len(residuals), max_vectors)
     length = np.hypot(*residuals.residual_px.T)
-    factor = magnify or _magnification(float(np.quantile(length, 0.9)), max(residuals.size_px))
+    factor = magnify or magnification(float(np.quantile(length, 0.9)), max(residuals.size_px))
     _arrows(axes, residuals.xy_px[chosen], residuals.residual_px[chosen], factor, BLUE)
     shown = what if len(chosen) == len(residuals) else f"{len(chosen)} of {len(residuals)} {what}"
     axes.set_title(f"{shown}, × {factor:g}")
@@ -74,29 +72,19 @@ def residual_field(residuals: Residuals, *, cells: int = 10, min_per_cell: int =
     if not len(residuals):
         say_nothing_to_show(axes, _NOBODY)
         return figure
-    side = max(residuals.size_px) / cells
-    columns, rows = (max(1, math.ceil(size / side - 1e-9)) for size in residuals.size_px)
-    at = np.clip((residuals.xy_px // side).astype(np.int64), 0, [columns - 1, rows - 1])
-    cell = at[:, 1] * columns + at[:, 0]
-    count = np.bincount(cell, minlength=rows * columns)
-    with np.errstate(invalid="ignore"):
-        mean = np.stack(
-            [np.bincount(cell, residuals.residual_px[:, i], rows * columns) / count for i in (0, 1)], axis=1
-        )
-    full = count >= min_per_cell
+    means = cell_means(residuals, cells=cells, min_per_cell=min_per_cell)
+    side, (rows, columns), full, beyond = means.side_px, means.shape, means.full, means.beyond
     if not full.any():
         say_nothing_to_show(axes, f"no cell with {min_per_cell} inliers")
         return figure
-    length = np.hypot(*mean.T)
+    length = means.length_px
     shown = np.ma.masked_array(length, ~full).reshape(rows, columns)
     edges = np.arange(columns + 1) * side, np.arange(rows + 1) * side
     mesh = axes.pcolormesh(*edges, shown, cmap=SEQUENTIAL, vmin=0.0, rasterized=False, alpha=0.9)
     figure.colorbar(mesh, ax=axes, label="mean residual, px", **COLOUR_BAR)
-    centre = np.stack(np.meshgrid((np.arange(columns) + 0.5) * side, (np.arange(rows) + 0.5) * side), -1).reshape(-1, 2)
-    factor = _magnification(float(np.quantile(length[full], 0.9)), 1.2 * side / _ARROW_SHARE)
-    beyond = full & (length**2 * count > _CHI2_99 * residuals.sigma_px**2)
+    factor = magnification(float(np.quantile(length[full], 0.9)), 1.2 * side / ARROW_SHARE)
     for these, colour in ((full & ~beyond, _ON_CELLS), (beyond, VERMILION)):
-        _arrows(axes, centre[these], mean[these], factor, colour, width=0.006, edge=_AROUND)
+        _arrows(axes, means.centre_px[these], means.mean_px[these], factor, colour, width=0.006, edge=_AROUND)
     axes.set_title(f"cell means, × {factor:g}; orange: beyond noise ({int(beyond.sum())} of {int(full.sum())})")
     return figure
 
@@ -111,12 +99,7 @@ def radial_profile(residuals: Residuals, *, bins: int = 12, max_points: int = 40
     if len(residuals) < 2 * bins:
         say_nothing_to_show(axes, f"too few inliers ({len(residuals)}) for a profile")
         return figure
-    offset = residuals.xy_px - np.array(residuals.centre_px)
-    radius = np.hypot(*offset.T)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = np.where(radius[:, None] > 0, offset / radius[:, None], 0.0)
-    radial = np.einsum("ni,ni->n", unit, residuals.residual_px)
-    tangential = unit[:, 0] * residuals.residual_px[:, 1] - unit[:, 1] * residuals.residual_px[:, 0]
+    radius, radial, tangential = radial_parts(residuals)
     chosen = evenly(len(radius), max_points)
     axes.plot(radius[chosen], radial[chosen], ".", color=MUTED, alpha=0.35, markersize=2.0, label="_")
     axes.axhline(0.0, color=MUTED, linewidth=0.6)
@@ -124,7 +107,7 @@ def radial_profile(residuals: Residuals, *, bins: int = 12, max_points: int = 40
         (radial, VERMILION, "o-", "along the radius"),
         (tangential, BLUE, "s--", "across it"),
     ):
-        middle, mean, error = _profile(radius, values, bins)
+        middle, mean, error = profile(radius, values, bins)
         axes.fill_between(middle, mean - 2.0 * error, mean + 2.0 * error, color=colour, alpha=0.2, linewidth=0)
         axes.plot(middle, mean, style, color=colour, label=f"{name}, mean ± 2 s.e.")
     reach = max(3.5 * residuals.sigma_px, 1e-9)
@@ -165,13 +148,6 @@ def inliers_on_photo(residuals: Residuals, photo: NDArray[Any], *, max_points: i
     return figure
 
 
-def evenly(count: int, at_most: int) -> IntArray:
-    """Return rows: all, or ``at_most`` of them evenly spaced in their order."""
-    if count <= at_most:
-        return np.arange(count, dtype=np.int64)
-    return np.floor((np.arange(at_most) + 0.5) * count / at_most).astype(np.int64)
-
-
 def _image_axes(residuals: Residuals, space_in: float = 0.0) -> tuple[Figure, Axes]:
     """Return axes with the image's frame: x to the right, y down, equal scale; ``space_in`` for a colour bar below."""
     width, height = (float(max(size, 1.0)) for size in residuals.size_px)
@@ -210,21 +186,3 @@ def _arrows(
         edgecolor=edge,
         linewidth=0.0 if edge == "none" else 0.25,
     )
-
-
-def _magnification(long_px: float, size_px: float) -> float:
-    """Return 1, 2 or 5 times a power of ten."""
-    if not long_px > 0:
-        return 1.0
-    wanted = _ARROW_SHARE * size_px / long_px
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1 + 1e-9)) * power)
-
-
-def _profile(radius: FloatArray, values: FloatArray, bins: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Middle, mean and standard error in bins of equal count."""
-    parts = np.array_split(np.argsort(radius, kind="stable"), bins)
-    middle = np.array([radius[part].mean() for part in parts])
-    mean = np.array([values[part].mean() for part in parts])
-    error = np.array([values[part].std(ddof=1) / math.sqrt(len(part)) for part in parts])
-    return middle, mean, error

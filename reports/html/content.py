@@ -133,7 +133,9 @@ def _count(content: RunContent, row: Row) -> None:
 def _read_cameras(content: RunContent) -> None:
     columns = [column.name for column in TABLES["cameras"]]
     worst: list[tuple[Any, int, Row]] = []
-    for _, rows in content.run.parts("cameras", columns):
+    for part, rows in content.run.parts("cameras", columns):
+        for row in rows:
+            row["part"] = part
         keyed = [(_camera_severity(row), content.num_cameras + i, row) for i, row in enumerate(rows)]
         content.num_cameras += len(rows)
         worst = heapq.nsmallest(MAX_CAMERAS, [*worst, *keyed])

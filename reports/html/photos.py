@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-_LONGER_SIDE: Final = 900
+THUMBNAIL: Final = 112  # px, the longer side
+PHOTO: Final = 900
 _MAX_PIXELS: Final = 400_000_000  # a file that unpacks to more is no photo
 
 
@@ -35,15 +36,24 @@ def find_photo(folder: Path, row: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def read_photo(path: Path) -> NDArray[Any] | None:
-    """Return a photo as (rows, columns, 3), at most 900 px long, not turned, as COLMAP reads it; None if unreadable."""
+def photo_urls(path: Path, *longer_sides: int) -> list[str] | None:
+    """Return a photo as JPEG data URLs, one per size, the largest first; not turned, as COLMAP reads it.
+
+    Nothing but pixels of the file is passed on. None where it cannot be read.
+    """
     try:
         with Image.open(path) as photo:
             if photo.width * photo.height > _MAX_PIXELS:
                 return None
-            photo.draft("RGB", (_LONGER_SIDE, _LONGER_SIDE))
+            photo.draft("RGB", (longer_sides[0], longer_sides[0]))
             small = photo.convert("RGB")
-        small.thumbnail((_LONGER_SIDE, _LONGER_SIDE))
-        return np.asarray(small)
+        return [_url(small, side) for side in longer_sides]
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
+
+
+def _url(photo: Image.Image, side: int) -> str:
+    photo.thumbnail((side, side))
+    content = BytesIO()
+    photo.save(content, format="jpeg", quality=80 if side > THUMBNAIL else 60, optimize=True, exif=b"")
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"

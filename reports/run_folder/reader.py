@@ -110,6 +110,24 @@ class RunReader:
             read = part.read(columns=[*columns, "image_id"])
             return read.filter(pc.field("image_id") == image_id)
 
+    def rows_of_camera(self, name: str, camera_id: int, columns: Sequence[str]) -> pa.Table:
+        """Return the observations of all images of a camera in the part called ``name``.
+
+        Raises
+        ------
+        DamagedRunError
+            It is not what the run wrote.
+        """
+        key = name.removeprefix("part-").removesuffix(".parquet")
+        model = self._find(key)
+        if model is None:
+            raise DamagedRunError(self.folder, f"its {MANIFEST} names no part {name}")
+        with self._part("images", model) as part:
+            images = part.read(columns=["image_id", "camera_id"])
+        mine = images.filter(pc.field("camera_id") == camera_id)["image_id"]
+        with self._part("observations", model) as part:
+            return part.read(columns=[*columns, "image_id"]).filter(pc.field("image_id").isin(mine.combine_chunks()))
+
     def _find(self, key: str) -> ModelRecord | None:
         if isinstance(self.contents, Manifest):
             return self.contents.find(key)

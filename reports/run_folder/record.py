@@ -93,6 +93,8 @@ class RunRecord(_Record):
     counts: dict[str, _Count] = Field(default_factory=dict)
     failures: tuple[FailureRecord, ...] = Field(default=(), fail_fast=True)
     seconds: float = Field(default=0.0, ge=0)
+    finished: str | None = Field(default=None, max_length=40)
+    command: _Text | None = None
     manifest: ManifestRecord | None = None
     inputs: tuple[Any, ...] | None = None  # before there was a manifest
 

@@ -192,10 +192,17 @@ class RunStore:
         write_whole(path, [text.encode(errors="backslashreplace")])
         self.reports[ref.model_path] = f"{ERRORS}/{path.name}"
 
-    def finish(self, keep: Iterable[str] | None, failures: Iterable[RunFailure], seconds: float) -> None:
+    def finish(
+        self,
+        keep: Iterable[str] | None,
+        failures: Iterable[RunFailure],
+        seconds: float,
+        told: Mapping[str, str] | None = None,
+    ) -> None:
         """Complete manifest and run.json, after removing all models but those in ``keep``.
 
         keep: None: all that are intact.    seconds: how long the run took.
+        told: what else run.json should say, for people: ``finished`` (when) and ``command``.
         """
         failures = [RunFailure(*failure) for failure in failures]
         if keep is None:
@@ -214,6 +221,7 @@ class RunStore:
             "manifest": manifest.model_dump(),
             "failures": [failure._asdict() for failure in failures],
             "seconds": round(seconds, 3),
+            **(told or {}),
         }
         self._write_run_json("complete", content)
 

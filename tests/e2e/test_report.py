@@ -1,6 +1,7 @@
 """sfm-audit report and run --observations as a user meets them."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -105,7 +106,11 @@ def test_the_recomputed_pictures_are_those_of_the_observations():
     assert main(["report", "RUN", "--worst", "1", "-o", "a.html", "--quiet"]) == 0
     run("--observations")
     assert main(["report", "RUN", "--worst", "1", "-o", "b.html", "--quiet"]) == 0
-    assert Path("a.html").read_text() == Path("b.html").read_text()
+    pages = [
+        re.sub(r'<dl class="run">.*?</dl>', "", Path(name).read_text(), flags=re.DOTALL)
+        for name in ("a.html", "b.html")
+    ]
+    assert pages[0] == pages[1]  # but for when, and by which command
 
 
 def test_photos_show_the_inliers():

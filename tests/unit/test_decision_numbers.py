@@ -45,6 +45,7 @@ def camera_step(step=(10.0, 0.1), plain=(12.0, 0.2), sd=(1.0, 1.0), px=(0.3, 0.4
         sd_focal_rel=0.001,
         focal_identified=True,
         implied=stored + np.array(step),
+        correlation=np.eye(2),
     )
 
 

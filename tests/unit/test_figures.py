@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 from sfm_audit.reports import figures
+from sfm_audit.reports.charts.numbers import evenly
 from sfm_audit.reports.figures import CAPTIONS, ResidualError, Residuals
-from sfm_audit.reports.figures.sensor import evenly
 
 SIZE = (1600.0, 1200.0)
 IMAGE_FIGURES = [

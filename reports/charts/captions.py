@@ -7,6 +7,9 @@ from typing import Final
 CAPTIONS: Final[dict[str, str]] = {
     "residual_vectors": "Residuals, observed minus projected, magnified. Without a pattern: noise.",
     "residual_field": "Mean residual over the sensor. Orange: longer than noise leaves in one cell of a hundred.",
+    "camera_field": "Residual field of the camera: means over all its images, magnified. A lens that its model can say "
+    "leaves nothing but noise here; orange: longer than noise leaves in one cell of a hundred.",
+    "correlations": "Correlations of its own parameters in the joint system. Near 1 or -1, one stands in for another.",
     "radial_profile": "Radial profile. Off zero along the radius: the lens bends otherwise than its model.",
     "standardised_histogram": "Standardised residuals against N(0, 1).",
     "qq_plot": "Q-Q plot: on the line where the noise is what the noise model says.",
