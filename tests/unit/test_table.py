@@ -69,9 +69,9 @@ def test_types_are_design_s(column):  # noqa: C901 # one branch per kind of colu
         wanted = pa.bool_()
     elif column.name in TEXT:
         wanted = pa.string()
-    elif column.name == "params":
+    elif column.name in {"params", "own_correlations"}:
         wanted = pa.list_(pa.float64())
-    elif column.name in {"reasons", "witnesses"}:
+    elif column.name in {"reasons", "witnesses", "own_parameters"}:
         wanted = pa.list_(pa.string())
     elif column.name == "reason_details":
         numbers, texts = ("value", "limit"), ("code", "verdict", "unit", "group", "text")
