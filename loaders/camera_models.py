@@ -1,8 +1,11 @@
-"""COLMAP's camera models: ids as on disk, names, and the meaning of each parameter, one record each in one list.
+"""Camera models: ids, names, and the meaning of each parameter, one record each in one list; COLMAP's come first.
 
 The mathematics of a model is its record of the same name in `audit.cameras.models`.
 
-Source: COLMAP 4.2 ``src/colmap/sensor/models.h``; checked against ``pycolmap.CameraModelId`` in the tests.
+Source of ids 0 to 17: COLMAP 4.2 ``src/colmap/sensor/models.h``; checked against ``pycolmap.CameraModelId`` in the
+tests. Ids from 1000 on are this program's own, for lenses of other programs that COLMAP cannot write down; no file
+holds them. A parameter's name means the same in all models: ``p1`` is the factor of 2 u v in x, as in OpenCV; readers
+of formats that count otherwise exchange the numbers.
 """
 
 from __future__ import annotations
@@ -13,16 +16,21 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """One of COLMAP's camera models.
+    """One camera model.
 
-    model_id, name: as in files.    param_names: in the order in which files store the parameters.
-    is_spherical: whether the camera sees directions behind it (no Zc > 0 condition, method.md section 1).
+    model_id, name: of COLMAP's models as in its files.    param_names: in the order in which files store the
+    parameters. is_spherical: whether the camera sees directions behind it (no Zc > 0 condition, method.md section 1).
     """
 
     model_id: int
     name: str
     param_names: tuple[str, ...]
     is_spherical: bool = False
+
+    @property
+    def is_colmap(self) -> bool:
+        """Whether COLMAP has this model."""
+        return self.model_id < FIRST_OWN_ID
 
     @property
     def num_params(self) -> int:
@@ -44,6 +52,9 @@ class CameraModel:
         """Rows of the distortion parameters; empty for EQUIRECTANGULAR, whose parameters are the image size."""
         known = {"f", "fx", "fy", "cx", "cy", "w", "h"}
         return tuple(i for i, name in enumerate(self.param_names) if name not in known)
+
+
+FIRST_OWN_ID: Final = 1000
 
 
 def _model(model_id: int, name: str, params: str, *, is_spherical: bool = False) -> CameraModel:
@@ -69,6 +80,20 @@ CAMERA_MODELS: Final[tuple[CameraModel, ...]] = (
     _model(15, "FISHEYE", "fx fy cx cy"),
     _model(16, "EUCM", "fx fy cx cy alpha beta"),
     _model(17, "EQUIRECTANGULAR", "w h", is_spherical=True),
+    # OpenSfM brown, BlocksExchange: three radial and two tangential terms; one focal length: OpenMVG pinhole_brown_t2
+    _model(1000, "BROWN", "fx fy cx cy k1 k2 p1 p2 k3"),
+    _model(1001, "SIMPLE_BROWN", "f cx cy k1 k2 p1 p2 k3"),
+    # OpenMVG pinhole_radial_k3
+    _model(1002, "RADIAL_3", "f cx cy k1 k2 k3"),
+    # OpenMVG fisheye: OPENCV_FISHEYE with one focal length
+    _model(1003, "SIMPLE_OPENCV_FISHEYE", "f cx cy k1 k2 k3 k4"),
+    # OpenSfM dual: perspective (transition 1) to equidistant (0), then two radial terms
+    _model(1004, "DUAL", "f cx cy k1 k2 transition"),
+    # Metashape frame, BlocksExchange with skew; b1, b2 as shares of f: x = f ((1 + b1) x' + b2 y') + cx
+    _model(1005, "FRAME", "f cx cy k1 k2 p1 p2 k3 k4 b1 b2"),
+    # VisualSFM: the polynomial leads from the distorted to the undistorted point, u = d (1 + k d^2)
+    _model(1006, "INVERSE_RADIAL", "f cx cy k"),
 )
+COLMAP_MODELS: Final = tuple(model for model in CAMERA_MODELS if model.is_colmap)
 BY_ID: Final[dict[int, CameraModel]] = {model.model_id: model for model in CAMERA_MODELS}
 BY_NAME: Final[dict[str, CameraModel]] = {model.name: model for model in CAMERA_MODELS}

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TypeVar
 
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.colmap.formats import BINARY, TEXT
 from sfm_audit.loaders.colmap.pairs import database_pairs
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
+from sfm_audit.loaders.foreign.bal import BAL
+from sfm_audit.loaders.foreign.bundler import BUNDLER
+from sfm_audit.loaders.foreign.nvm import NVM
 from sfm_audit.loaders.model import PairSource, SparseModel
-from sfm_audit.loaders.model_format import ModelFormat, ModelWriter
+from sfm_audit.loaders.model_format import ModelFormat, ModelWriter, matching
 from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
 
-FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT)
+FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, BUNDLER, NVM, BAL)
 """Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
 
 _Value = TypeVar("_Value")
@@ -25,21 +29,36 @@ def format_names() -> tuple[str, ...]:
     return tuple(each.name for each in FORMATS)
 
 
-def model_file_names() -> tuple[str, ...]:
-    """Return the names of all files that can belong to a model, in a fixed order."""
-    return tuple(dict.fromkeys(name for each in FORMATS for name in each.files))
+def written_file_names() -> tuple[str, ...]:
+    """Return the names of all files that a model can be written to, in a fixed order."""
+    return tuple(dict.fromkeys(name for each in FORMATS if each.writer for name in each.files))
+
+
+def model_files_among(names: Collection[str]) -> tuple[str, ...]:
+    """Return those of a folder's names that can belong to a model, in a fixed order."""
+    return tuple(dict.fromkeys(name for each in FORMATS for name in each.among(names)))
+
+
+def model_file_names(folder: InputPath) -> tuple[str, ...]:
+    """Return the names of all files in ``folder`` that can belong to its model, in a fixed order.
+
+    Of a folder of this machine that cannot be listed, those whose names are known beforehand and that exist.
+    """
+    known = tuple(dict.fromkeys(name for each in FORMATS for name in each.files))
+    there = {name for name in known if "*" not in name and exists(folder / name)} if isinstance(folder, Path) else set()
+    return model_files_among(there | set(names_in(folder)))
 
 
 def marks_model(names: Collection[str]) -> bool:
     """Whether a folder with these names counts as a model folder: it has a file that some format requires."""
-    return any(name in names for each in FORMATS for name in each.required)
+    return any(matching(name, names) for each in FORMATS for name in each.required)
 
 
 def files_read(listing: Mapping[str, _Value]) -> dict[str, _Value]:
     """Return the part of a folder's listing that its model is read from; of an incomplete model all of its files."""
     found = next((each for each in FORMATS if each.matches(listing)), None)
-    names = found.files if found else model_file_names()
-    return {name: listing[name] for name in names if name in listing}
+    names = found.among(listing) if found else model_files_among(listing)
+    return {name: listing[name] for name in names}
 
 
 def format_of(folder: InputPath) -> ModelFormat:
@@ -52,7 +71,7 @@ def format_of(folder: InputPath) -> ModelFormat:
     UnreadableFileError
         ``folder`` is a file.
     """
-    there = [name for name in model_file_names() if exists(folder / name)]
+    there = model_file_names(folder)
     found = next((each for each in FORMATS if each.matches(there)), None)
     if found is not None:
         return found
@@ -65,8 +84,7 @@ def format_of(folder: InputPath) -> ModelFormat:
 
 def files_of(folder: InputPath) -> tuple[InputPath, ...]:
     """Return the files that the model in ``folder`` is read from, in a fixed order; errors as of `format_of`."""
-    paths = [folder / name for name in format_of(folder).files]
-    return tuple(path for path in paths if exists(path))
+    return tuple(folder / name for name in format_of(folder).among(model_file_names(folder)))
 
 
 def format_named(name: str) -> ModelFormat:
@@ -123,10 +141,12 @@ def verified_pairs_of(model: SparseModel, database: str | None, shown_as: str) -
     return None if database is None else database_pairs(model, database, shown_as)
 
 
-def _incomplete(folder: InputPath, there: list[str]) -> MissingFileError:
+def _incomplete(folder: InputPath, there: tuple[str, ...]) -> MissingFileError:
     """Return the error for a folder in which no format is complete; the format that lacks least is meant."""
-    meant = max(FORMATS, key=lambda each: sum(name in there for name in each.required))  # the first of equals
-    missing = [name for name in meant.required if name not in there]
+    meant = max(
+        FORMATS, key=lambda each: sum(bool(matching(name, there)) for name in each.required)
+    )  # the first of equals
+    missing = [name for name in meant.required if not matching(name, there)]
     wanted = (
         f"{', '.join(meant.required[:-1])} and {meant.required[-1]}" if len(meant.required) > 1 else meant.required[0]
     )

@@ -67,6 +67,9 @@ class FindingCode(StrEnum):
     WEAKLY_CONNECTED = "weakly_connected"
     RIG_POSE_DISAGREES = "rig_pose_disagrees"
     RIG_NOT_CONSTANT = "rig_not_constant"
+    IMAGE_SIZE_ASSUMED = "image_size_assumed"
+    OBSERVATIONS_WITHOUT_IMAGE = "observations_without_image"
+    SEVERAL_RECONSTRUCTIONS = "several_reconstructions"
 
 
 FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
@@ -110,6 +113,9 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.IMPLIED_TANGENTIAL: "p1 and p2, which the camera model lacks, would be so large",
     FindingCode.JOINT_IN_BLOCKS: "the model is too large for one joint system; it was solved in blocks of covisibility",
     FindingCode.NOISE_PRIOR_NOT_CONVERGED: "the prior of the track noise did not converge: KS rests on what it reached",
+    FindingCode.IMAGE_SIZE_ASSUMED: "the format stores no image sizes; one that holds all observations was taken",
+    FindingCode.OBSERVATIONS_WITHOUT_IMAGE: "observations of images that have no pose or do not exist; not read",
+    FindingCode.SEVERAL_RECONSTRUCTIONS: "the file holds several reconstructions, each with its own points and scale",
     FindingCode.TRACK_STATISTICS_FROM_ALL_IMAGES: "too many images are away from their optimum to leave them out",
     FindingCode.CONTRADICTED_PAIRS: "verified pairs that the cameras contradict: a fold, or false pairs left out",
     FindingCode.DATABASE_NOT_USED: "there is no database.db, or it does not fit the model: its pairs were not asked",

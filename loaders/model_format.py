@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,7 +39,8 @@ class ModelFormat:
         What the column ``file_format`` of the tables holds.
     required, optional : tuple of str
         Names of the files in a model folder. A folder with one of the required files counts as a model, so that an
-        incomplete model is reported instead of passed over.
+        incomplete model is reported instead of passed over. A name with a ``*`` stands for all names like it; where a
+        folder holds several, the reader says which it wants.
     read : callable
         Reads the model in a folder; raises `loaders.errors.LoadError` where that cannot be done.
     count_images : callable
@@ -69,4 +71,15 @@ class ModelFormat:
 
     def matches(self, names: Collection[str]) -> bool:
         """Whether a folder that holds these names holds a complete model of this format."""
-        return all(name in names for name in self.required)
+        return all(matching(name, names) for name in self.required)
+
+    def among(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return those of ``names`` that are files of this format, the required ones first."""
+        return tuple(dict.fromkeys(found for name in self.files for found in matching(name, names)))
+
+
+def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return those of ``names`` that a format's name means: itself, or all that its ``*`` fits, sorted."""
+    if "*" in pattern:
+        return tuple(sorted(name for name in names if fnmatchcase(name, pattern)))
+    return (pattern,) if pattern in names else ()

@@ -33,6 +33,13 @@ PARAMS = {
     "SIMPLE_FISHEYE": (),
     "FISHEYE": (),
     "EUCM": (0.6, 1.1),
+    "BROWN": (-0.05, 0.01, 1e-3, -5e-4, 0.002),
+    "SIMPLE_BROWN": (-0.05, 0.01, 1e-3, -5e-4, 0.002),
+    "RADIAL_3": (-0.05, 0.01, 0.002),
+    "SIMPLE_OPENCV_FISHEYE": (-0.02, 0.01, -0.004, 0.001),
+    "DUAL": (-0.05, 0.01, 0.7),
+    "FRAME": (-0.05, 0.01, 1e-3, -5e-4, 0.002, -0.001, 0.003, -0.002),
+    "INVERSE_RADIAL": (-0.05,),
 }
 NOISE = {
     "gaussian": lambda rng, n: rng.standard_normal((2, n)),

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 from sfm_audit.audit.cameras.functions import CameraFunctions, Family, Term, fisheye, perspective, rational
+from sfm_audit.audit.cameras.other_warps import brown, dual, frame, inverse_radial, inverse_radial_rays
 from sfm_audit.audit.cameras.rational import (
     division_depth,
     division_folds,
@@ -21,7 +22,8 @@ from sfm_audit.audit.cameras.warps import fov, full_opencv, identity, opencv, ra
 from sfm_audit.loaders.camera_models import CameraModel
 
 _ONE, _TWO = (Term.RADIAL_2,), (Term.RADIAL_2, Term.RADIAL_4)
-_FOUR = (*_TWO, Term.RADIAL_6, Term.RADIAL_8)
+_THREE = (*_TWO, Term.RADIAL_6)
+_FOUR = (*_THREE, Term.RADIAL_8)
 _ASPECT, _TANGENTIAL = (Term.ASPECT,), (Term.TANGENTIAL,)
 _RAD_TAN_SYNONYMS: Final = {f"k{i}": (f"k{i + 1}",) for i in range(6)} | {"p0": ("p2",)}
 
@@ -49,6 +51,15 @@ CAMERA_FUNCTIONS: Final[tuple[CameraFunctions, ...]] = (
     rational("EUCM", eucm_plane, eucm_depth, (*_ASPECT, *_TWO), "PINHOLE"),
     CameraFunctions(
         name="EQUIRECTANGULAR", plane=spherical_plane, rays=spherical_rays, distort=None, terms=frozenset()
+    ),
+    perspective("BROWN", brown, (*_ASPECT, *_THREE, *_TANGENTIAL), "PINHOLE"),
+    perspective("SIMPLE_BROWN", brown, (*_THREE, *_TANGENTIAL), "SIMPLE_PINHOLE"),
+    perspective("RADIAL_3", radial, _THREE, "SIMPLE_PINHOLE"),
+    fisheye("SIMPLE_OPENCV_FISHEYE", radial, _FOUR, "SIMPLE_FISHEYE"),
+    perspective("DUAL", dual, _TWO, "SIMPLE_PINHOLE", Family.NONE),
+    perspective("FRAME", frame, (*_ASPECT, *_FOUR, *_TANGENTIAL), "SIMPLE_PINHOLE"),
+    replace(
+        perspective("INVERSE_RADIAL", inverse_radial, _ONE, "SIMPLE_PINHOLE", Family.NONE), rays=inverse_radial_rays
     ),
 )
 FUNCTIONS: Final[dict[str, CameraFunctions]] = {each.name: each for each in CAMERA_FUNCTIONS}

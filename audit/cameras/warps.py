@@ -79,13 +79,13 @@ def radial_gain(r2: FloatArray, extra: Sequence[float]) -> tuple[FloatArray, Col
     return gain, slope
 
 
-def _tangential_extra(u: FloatArray, v: FloatArray, r2: FloatArray) -> tuple[Pair, Pair]:
+def tangential_extra(u: FloatArray, v: FloatArray, r2: FloatArray) -> tuple[Pair, Pair]:
     """Return the derivatives by p1 and p2."""
     double_cross = 2.0 * u * v
     return (double_cross, r2 + 2.0 * v * v), (r2 + 2.0 * u * u, double_cross)
 
 
-def _radial_tangential(
+def radial_tangential(
     u: FloatArray, v: FloatArray, r2: FloatArray, gain: FloatArray, slope: Column, *, p1: float, p2: float, want: Want
 ) -> Warp:
     """Return (u, v) gain plus the tangential terms, without derivatives by extra parameters."""
@@ -106,10 +106,10 @@ def opencv(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want) -> 
     r2 = u * u + v * v
     gain, slope = _polynomial(r2, (k1, k2))
     gain += 1.0
-    warp = _radial_tangential(u, v, r2, gain, slope, p1=p1, p2=p2, want=want)
+    warp = radial_tangential(u, v, r2, gain, slope, p1=p1, p2=p2, want=want)
     if want is not Want.D_EXTRA:
         return warp
-    return warp._replace(d_extra=(*_radial_extra(u, v, r2, 2), *_tangential_extra(u, v, r2)))
+    return warp._replace(d_extra=(*_radial_extra(u, v, r2, 2), *tangential_extra(u, v, r2)))
 
 
 def full_opencv(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want) -> Warp:
@@ -120,12 +120,12 @@ def full_opencv(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want
     lower, d_lower = _polynomial(r2, (k4, k5, k6))
     inverse = 1.0 / (1.0 + lower)
     gain = (1.0 + upper) * inverse
-    warp = _radial_tangential(u, v, r2, gain, (d_upper - gain * d_lower) * inverse, p1=p1, p2=p2, want=want)
+    warp = radial_tangential(u, v, r2, gain, (d_upper - gain * d_lower) * inverse, p1=p1, p2=p2, want=want)
     if want is not Want.D_EXTRA:
         return warp
     above = _radial_extra(u * inverse, v * inverse, r2, 3)
     below = tuple((-gain * x, -gain * y) for x, y in above)
-    return warp._replace(d_extra=(*above[:2], *_tangential_extra(u, v, r2), above[2], *below))
+    return warp._replace(d_extra=(*above[:2], *tangential_extra(u, v, r2), above[2], *below))
 
 
 def thin_prism(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want) -> Warp:
@@ -134,14 +134,14 @@ def thin_prism(u: FloatArray, v: FloatArray, extra: Sequence[float], want: Want)
     r2 = u * u + v * v
     gain, slope = _polynomial(r2, (k1, k2, k3, k4))
     gain += 1.0
-    warp = _radial_tangential(u, v, r2, gain, slope, p1=p1, p2=p2, want=want)
+    warp = radial_tangential(u, v, r2, gain, slope, p1=p1, p2=p2, want=want)
     x, y = warp.x + sx1 * r2, warp.y + sy1 * r2
     if want is Want.VALUE:
         return Warp(x, y)
     d_extra: tuple[Pair, ...] = ()
     if want is Want.D_EXTRA:
         powers = _radial_extra(u, v, r2, 4)
-        d_extra = (*powers[:2], *_tangential_extra(u, v, r2), *powers[2:], (r2, 0.0), (0.0, r2))
+        d_extra = (*powers[:2], *tangential_extra(u, v, r2), *powers[2:], (r2, 0.0), (0.0, r2))
     xu, xv = warp.xu + (2.0 * sx1) * u, warp.xv + (2.0 * sx1) * v
     yu, yv = warp.yu + (2.0 * sy1) * u, warp.yv + (2.0 * sy1) * v
     return Warp(x, y, xu, xv, yu, yv, d_extra)
@@ -156,7 +156,7 @@ def rad_tan_thin_prism(u: FloatArray, v: FloatArray, extra: Sequence[float], wan
     first = radial(u, v, extra[:6], want)
     a, b = first.x, first.y
     r2 = a * a + b * b
-    second = _radial_tangential(a, b, r2, np.ones_like(a), 0.0, p1=p1, p2=p0, want=want)
+    second = radial_tangential(a, b, r2, np.ones_like(a), 0.0, p1=p1, p2=p0, want=want)
     x, y = second.x + r2 * (s0 + s1 * r2), second.y + r2 * (s2 + s3 * r2)
     if want is Want.VALUE:
         return Warp(x, y)
@@ -164,7 +164,7 @@ def rad_tan_thin_prism(u: FloatArray, v: FloatArray, extra: Sequence[float], wan
     xa, xb, ya, yb = second.xu + prism_x * a, second.xv + prism_x * b, second.yu + prism_y * a, second.yv + prism_y * b
     d_extra: tuple[Pair, ...] = ()
     if want is Want.D_EXTRA:
-        d_p1, d_p0 = _tangential_extra(a, b, r2)
+        d_p1, d_p0 = tangential_extra(a, b, r2)
         r4 = r2 * r2
         d_radial = tuple((xa * da + xb * db, ya * da + yb * db) for da, db in first.d_extra)
         d_extra = (*d_radial, d_p0, d_p1, (r2, 0.0), (r4, 0.0), (0.0, r2), (0.0, r4))

@@ -1,4 +1,4 @@
-"""What each of COLMAP's camera models can express, and how one model's parameters look in a larger one.
+"""What each camera model can express, and how one model's parameters look in a larger one.
 
 The test never asks this table: whether a model has a group follows from the rank of the group's fields after
 projection. It is for advice.
@@ -11,7 +11,7 @@ import numpy as np
 from sfm_audit.audit.cameras.functions import Family
 from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS, CameraModel
+from sfm_audit.loaders.camera_models import BY_NAME, COLMAP_MODELS, CameraModel
 
 
 def undistorted_model(model: CameraModel) -> CameraModel | None:
@@ -21,7 +21,7 @@ def undistorted_model(model: CameraModel) -> CameraModel | None:
 
 
 def larger_models(model: CameraModel) -> tuple[CameraModel, ...]:
-    """Return the models that hold every term of ``model`` and have more parameters, fewest first, of its family.
+    """Return COLMAP's models that hold every term of ``model`` and have more parameters, fewest first, of its family.
 
     Families: the pinhole models with polynomial distortion, and the equidistant fisheyes. FOV, the division models and
     EUCM have no relatives; the first family takes their place, because their extra freedom is radial.
@@ -30,7 +30,7 @@ def larger_models(model: CameraModel) -> tuple[CameraModel, ...]:
         return ()
     functions = functions_of(model)
     family = Family.FISHEYE if functions.family is Family.FISHEYE else Family.POLYNOMIAL
-    relatives = [m for m in CAMERA_MODELS if functions_of(m).family is family]
+    relatives = [m for m in COLMAP_MODELS if functions_of(m).family is family]
     larger = [m for m in relatives if functions_of(m).terms >= functions.terms and m.num_params > model.num_params]
     return tuple(sorted(larger, key=lambda m: (m.num_params, m.model_id)))
 

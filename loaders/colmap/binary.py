@@ -29,7 +29,7 @@ from sfm_audit.loaders.assembly.raw import (
     duplicate_id,
     image_columns,
 )
-from sfm_audit.loaders.camera_models import BY_ID
+from sfm_audit.loaders.camera_models import BY_ID, COLMAP_MODELS
 from sfm_audit.loaders.colmap.binary_file import COUNT, RECOPY, Cursor, check_count, check_end, read_records, truncated
 from sfm_audit.loaders.colmap.binary_points import point_pieces, read_points
 from sfm_audit.loaders.errors import MalformedFileError, Position, TruncatedFileError
@@ -47,7 +47,7 @@ _POSE: Final = struct.Struct("<7d")
 _FRAME: Final = struct.Struct("<II7dI")
 _FRAME_DATA: Final = struct.Struct("<iIQ")
 _NAME_CHUNK: Final = 256
-_MAX_CAMERA_BYTES: Final = _CAMERA.size + 8 * max(model.num_params for model in BY_ID.values())
+_MAX_CAMERA_BYTES: Final = _CAMERA.size + 8 * max(model.num_params for model in COLMAP_MODELS)
 
 
 def read_model(folder: InputPath) -> RawModel:
@@ -70,8 +70,11 @@ def _read_camera(cursor: Cursor) -> tuple[int, RawCamera]:
     start = cursor.offset
     camera_id, model_id, width, height = cursor.unpack(_CAMERA, "a camera")
     model = BY_ID.get(model_id)
-    if model is None:
-        wanted, got = f"a camera model id from 0 to {max(BY_ID)}", f"model {model_id} of camera {camera_id}"
+    if model is None or not model.is_colmap:
+        wanted, got = (
+            f"a camera model id from 0 to {COLMAP_MODELS[-1].model_id}",
+            f"model {model_id} of camera {camera_id}",
+        )
         advice = "the file is damaged, or newer than this program"
         raise MalformedFileError(str(cursor.path), Position("byte", start + 4), wanted, got, advice)
     params = cursor.unpack(struct.Struct(f"<{model.num_params}d"), f"the parameters of camera {camera_id}")

@@ -28,7 +28,7 @@ from sfm_audit.loaders.assembly.raw import (
     duplicate_id,
     image_columns,
 )
-from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.camera_models import BY_NAME, COLMAP_MODELS
 from sfm_audit.loaders.colmap.text_points import read_points
 from sfm_audit.loaders.errors import Position
 from sfm_audit.loaders.model import CameraTable, Finding
@@ -107,8 +107,9 @@ def _read_camera(file: TextFile, line: int, tokens: list[bytes]) -> RawCamera:
         raise file.malformed(line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", f"{len(tokens)} values")
     camera_id = parse_uint(file, line, tokens[0], "a camera id")
     model = BY_NAME.get(tokens[1].decode("ascii", errors="backslashreplace"))
-    if model is None:
-        raise file.malformed(line, f"a camera model ({', '.join(BY_NAME)})", repr_token(tokens[1]))
+    if model is None or not model.is_colmap:
+        known = ", ".join(each.name for each in COLMAP_MODELS)
+        raise file.malformed(line, f"a camera model ({known})", repr_token(tokens[1]))
     width = parse_uint(file, line, tokens[2], "an image width", bits=64)
     height = parse_uint(file, line, tokens[3], "an image height", bits=64)
     params = tokens[4:]

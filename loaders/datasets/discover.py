@@ -24,7 +24,7 @@ from sfm_audit.loaders.datasets.layouts import (
 )
 from sfm_audit.loaders.datasets.walk import LIMITS, Folder, leads_out, walk
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
-from sfm_audit.loaders.formats import format_names, marks_model, model_file_names
+from sfm_audit.loaders.formats import format_names, marks_model, model_files_among
 from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
 
@@ -244,7 +244,7 @@ def _search_local(root: Path, layout: Layout | None, *, follow_links: bool) -> _
 def _files_out(folder: Folder, root: Path) -> list[str]:
     """Names of a model's files that are links to the outside of the PATH."""
     there = {*folder.files, *folder.folders}
-    return [name for name in model_file_names() if name in there and leads_out(folder.path / name, root)]
+    return [name for name in model_files_among(there) if leads_out(folder.path / name, root)]
 
 
 def _leads_out(folder: Path, names: list[str]) -> LoadError:
@@ -275,7 +275,7 @@ def _search_remote(root: RemotePath, layout: Layout | None) -> _Search:
                     continue
                 is_model = marks_model(listing)
                 if is_model:
-                    files = {name: listing[name] for name in model_file_names() if name in listing}
+                    files = {name: listing[name] for name in model_files_among(listing)}
                     found.append(_Found(parts, size_of(files), stamp_of(files)))
                 folders = [name for name, entry in listing.items() if entry.is_folder]
                 folders = folders_to_search(folder.parts, folders, is_model=is_model, layout=layout)

@@ -9,7 +9,7 @@ from stat import S_ISDIR
 
 from sfm_audit.loaders.datasets.fingerprint import files_in
 from sfm_audit.loaders.errors import LoadError
-from sfm_audit.loaders.formats import files_read, model_file_names
+from sfm_audit.loaders.formats import files_read, model_file_names, model_files_among
 from sfm_audit.loaders.paths.files import listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, parse_location
 
@@ -91,9 +91,9 @@ def model_files_in(folder: InputPath) -> dict[str, Entry]:
             listing = listing_of(folder)
         except LoadError:
             return {}  # opening the model says what is wrong
-        return {name: listing[name] for name in model_file_names() if name in listing}
+        return {name: listing[name] for name in model_files_among(listing)}
     files = {}
-    for name in model_file_names():
+    for name in model_file_names(folder):
         try:
             stat = (folder / name).stat()
         except OSError:

@@ -20,12 +20,12 @@ from sfm_audit.loaders import SparseModel, open_model
 from sfm_audit.loaders.arrays import BoolArray
 from sfm_audit.loaders.assembly.raw import offsets_of
 from sfm_audit.loaders.errors import MalformedFileError
-from sfm_audit.loaders.formats import format_named, model_file_names, writer_of
+from sfm_audit.loaders.formats import format_named, writer_of, written_file_names
 from sfm_audit.loaders.model import FindingCode, ObservationTable
 from sfm_audit.loaders.model_format import ModelWriter
 from sfm_audit.loaders.paths.files import exists
 
-MODEL_FILES: Final = frozenset(model_file_names())
+MODEL_FILES: Final = frozenset(written_file_names())
 MIN_VIEWS: Final = 2
 _CAMERA: Final = pycolmap.SensorType.CAMERA
 

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from model_promises import assert_is_a_model, damage
 from model_writer import binary_files, rig_model, text_files, write_binary, write_text
 
-from sfm_audit.loaders import FindingCode, LoadError, SparseModel, open_model
+from sfm_audit.loaders import FindingCode, LoadError, open_model
 
 BINARY, TEXT = binary_files(rig_model()), text_files(rig_model())
 HAND_WRITTEN = text_files(rig_model(), header=False)
@@ -65,25 +65,6 @@ def test_without_a_stated_count_a_cut_is_refused_or_told(tmp_path: Path, name: s
         assert model.findings, f"{name} cut at {length} is read without a word"
 
 
-def assert_is_a_model(model: SparseModel) -> None:
-    """The promises that the audit relies on."""
-    images, observations = model.images, model.observations
-    assert bool(np.all(np.diff(images.image_id.astype(np.int64)) > 0))
-    assert bool(np.all(np.diff(model.cameras.camera_id.astype(np.int64)) > 0))
-    assert bool(np.all(model.points.point3d_id[1:] > model.points.point3d_id[:-1]))
-    assert observations.offsets[0] == 0
-    assert observations.offsets[-1] == len(observations) == len(observations.xy_px)
-    assert len(observations.offsets) == len(images) + 1
-    assert bool(np.all((observations.point_idx >= -1) & (observations.point_idx < max(len(model.points), 1))))
-    assert bool(np.all((images.camera_idx >= -1) & (images.camera_idx < max(len(model.cameras), 1))))
-    for row in range(len(images)):
-        assert len(images.name[row].encode()) >= 0
-        camera = model.image(row).camera
-        assert camera is None or len(camera.params) == camera.model.num_params
-    for finding in model.findings:
-        assert finding.count > 0
-
-
 def assert_refused_or_a_model(folder: Path, changed: str) -> None:
     """A change may also make another file the odd one out: one that lacks what the changed one now refers to."""
     message = None
@@ -96,14 +77,6 @@ def assert_refused_or_a_model(folder: Path, changed: str) -> None:
     else:
         assert "\n" not in message
         assert changed in message or "as its own comment says" in message
-
-
-def damage(data: st.DataObject, content: bytes) -> bytes:
-    changed = bytearray(content)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(changed) - 1))
-        changed[at] = data.draw(st.integers(0, 255) | st.sampled_from(b" \n\0\xff\x7f-.#,"))
-    return bytes(changed)
 
 
 @pytest.mark.parametrize(("write", "files"), [(write_binary, BINARY), (write_text, TEXT)])

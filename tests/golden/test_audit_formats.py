@@ -11,7 +11,7 @@ from sfm_audit.audit import ModelAuditor, audit_model
 from sfm_audit.audit.simulate.adjust import adjust_scene, write_model
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 from sfm_audit.loaders import open_model
-from sfm_audit.loaders.camera_models import CAMERA_MODELS
+from sfm_audit.loaders.camera_models import COLMAP_MODELS
 
 IDENTITY = ["model_path", "file_format", "dataset", "scene", "component"]
 
@@ -81,7 +81,7 @@ def assert_residuals_are_pycolmap_s(folder, reconstruction):
     return auditor
 
 
-@pytest.mark.parametrize("model", CAMERA_MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize("model", COLMAP_MODELS, ids=lambda model: model.name)
 def test_every_camera_model_is_audited_as_pycolmap_projects(tmp_path, model):
     reconstruction = synthesized(tmp_path / "model", model=model)
     auditor = assert_residuals_are_pycolmap_s(tmp_path / "model", reconstruction)
@@ -100,7 +100,7 @@ def test_rigs_with_several_sensors(tmp_path):
 
 def test_a_point_across_the_seam_of_a_panorama_is_near(tmp_path):
     """Observed at one edge, predicted at the other: pycolmap measures angles, and so do we."""
-    model = next(m for m in CAMERA_MODELS if m.is_spherical)
+    model = next(m for m in COLMAP_MODELS if m.is_spherical)
     reconstruction = synthesized(tmp_path / "seam", model=model)
     image = next(iter(reconstruction.images.values()))
     moved = 0

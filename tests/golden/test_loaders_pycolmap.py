@@ -9,7 +9,7 @@ from corpus import REFUSED_BY_PYCOLMAP, UNREADABLE, needs_corpus, parametrize_mo
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.loaders import FindingCode, LoadError, SparseModel, open_model
-from sfm_audit.loaders.camera_models import CAMERA_MODELS
+from sfm_audit.loaders.camera_models import COLMAP_MODELS
 
 POSE_TOLERANCE = 1e-12
 NUM_MODELS = 18
@@ -144,9 +144,9 @@ def assert_tables_close(a: SparseModel, b: SparseModel, tolerance: float) -> Non
 
 def test_the_table_of_camera_models_is_pycolmap_s():
     theirs = {int(k): name for name, k in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
-    assert {model.model_id: model.name for model in CAMERA_MODELS} == theirs
+    assert {model.model_id: model.name for model in COLMAP_MODELS} == theirs
     assert len(theirs) == NUM_MODELS
-    for model in CAMERA_MODELS:
+    for model in COLMAP_MODELS:
         camera = pycolmap.Camera.create_from_model_name(1, model.name, 500.0, 640, 480)
         assert len(camera.params) == model.num_params
         assert list(model.focal_idxs) == list(camera.focal_length_idxs())
@@ -154,7 +154,7 @@ def test_the_table_of_camera_models_is_pycolmap_s():
 
 
 @pytest.mark.parametrize("file_format", ["binary", "text"])
-@pytest.mark.parametrize("camera_model", CAMERA_MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize("camera_model", COLMAP_MODELS, ids=lambda model: model.name)
 def test_every_camera_model(tmp_path: Path, camera_model, file_format: str):
     camera = pycolmap.Camera.create_from_model_name(11, camera_model.name, 500.0, 640, 480)
     # as two cameras with other numbers, so that an offset into the parameters that is wrong shows

@@ -13,7 +13,13 @@ PLAIN = {"f": 900.0, "fx": 900.0, "fy": 950.0, "cx": 800.0, "cy": 600.0, "w": 16
 RADIAL = {"k": -0.11, "k0": 0.08, "k1": -0.09, "k2": 0.03, "k3": -0.02, "k4": 0.014, "k5": 0.01, "k6": -0.006}
 TANGENTIAL = {"p0": -0.006, "p1": 0.008, "p2": -0.005}
 THIN_PRISM = {"s0": 0.006, "s1": -0.008, "s2": 0.004, "s3": 0.009, "sx1": 0.007, "sy1": -0.009}
-DISTORTED = PLAIN | RADIAL | TANGENTIAL | THIN_PRISM | {"omega": 0.8, "alpha": 0.6, "beta": 1.2}
+DISTORTED = (
+    PLAIN
+    | RADIAL
+    | TANGENTIAL
+    | THIN_PRISM
+    | {"omega": 0.8, "alpha": 0.6, "beta": 1.2, "transition": 0.6, "b1": 0.01, "b2": -0.02}
+)
 STENCIL = ((1.0, 8.0 / 12.0), (-1.0, -8.0 / 12.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))  # error h^4
 
 
@@ -123,7 +129,7 @@ def test_without_distortion_every_model_is_its_plain_one(name):
     model = BY_NAME[name]
     plain = BY_NAME["FISHEYE" if name.endswith("FISHEYE") else "PINHOLE"]
     xyz = np.concatenate([points(), [[0.0, 0.0, 1.0]]])
-    params = params_of(model, PLAIN | {"beta": 1.0})
+    params = params_of(model, PLAIN | {"beta": 1.0, "transition": 1.0})
     reference_params = params_of(plain, PLAIN | ({} if "fy" in model.param_names else {"fy": PLAIN["f"]}))
     ours = project_with_jacobians(model, params, xyz)
     reference = project_with_jacobians(plain, reference_params, xyz)

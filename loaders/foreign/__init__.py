@@ -1,0 +1,1 @@
+"""Reconstructions that other programs than COLMAP wrote: one file per format, facts first."""
