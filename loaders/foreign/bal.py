@@ -64,9 +64,11 @@ def read(folder: InputPath) -> RawModel:
 
 
 def _turned(quats: FloatArray) -> FloatArray:
-    """Return half a turn about x times each rotation: the quaternion (0, 1, 0, 0) times (w, x, y, z)."""
+    """Return half a turn about x times each rotation, w >= 0: the quaternion (0, 1, 0, 0) times (w, x, y, z)."""
     w, x, y, z = quats.T
-    return np.stack([-x, w, -z, y], axis=1)
+    turned = np.stack([-x, w, -z, y], axis=1)
+    result: FloatArray = np.where(turned[:, :1] < 0, -turned, turned)
+    return result
 
 
 def count_images(folder: InputPath) -> int:
