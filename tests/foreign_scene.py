@@ -4,6 +4,7 @@ Every writer follows the documentation of its format (docs/datasets.md names it)
 which is the format's own definition of a residual.
 """
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -219,3 +220,97 @@ def write(folder: Path, files: dict[str, bytes]) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     return folder
+
+
+def opensfm_camera(made: Scene) -> dict:
+    """io.py, camera_to_json: focal lengths and principal points as shares of the larger side."""
+    size = max(made.width, made.height)
+    kinds = {
+        "perspective": "perspective",
+        "fisheye": "fisheye",
+        "spherical": "spherical",
+        "brown": "brown",
+        "dual": "dual",
+    }
+    lens, kind = made.lens, made.kind
+    out = {"projection_type": kinds[kind], "width": made.width, "height": made.height}
+    if kind == "spherical":
+        return out
+    if {"p1", "k3", "cx_shift"} & set(lens) or lens["fx"] != lens["fy"]:
+        out |= {"projection_type": "brown", "focal_x": lens["fx"] / size, "focal_y": lens["fy"] / size}
+        out |= {"c_x": (lens["cx"] - made.width / 2) / size, "c_y": (lens["cy"] - made.height / 2) / size}
+        return out | {name: lens.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")}
+    return out | {"focal": lens["fx"] / size, "k1": lens.get("k1", 0.0), "k2": lens.get("k2", 0.0)}
+
+
+def opensfm_part(made: Scene, prefix: str = "") -> dict:
+    shots = {}
+    for row, (rotation, translation) in enumerate(zip(made.rotations, made.translations, strict=True)):
+        vector = Rotation.from_matrix(rotation).as_rotvec().tolist()
+        shots[f"{prefix}{row}.jpg"] = {"rotation": vector, "translation": translation.tolist(), "camera": "one"}
+    points = {str(100 + row): {"color": [1, 2, 3], "coordinates": xyz.tolist()} for row, xyz in enumerate(made.points)}
+    return {"cameras": {"one": opensfm_camera(made)}, "shots": shots, "points": points}
+
+
+def opensfm_tracks(made: Scene, prefix: str = "") -> str:
+    """tracks_manager.cc, version 2; normalised as features.py does it."""
+    xy = (made.xy - (made.width / 2, made.height / 2)) / max(made.width, made.height)
+    lines = []
+    for k in range(len(xy)):
+        words = (
+            f"{prefix}{made.image_idx[k]}.jpg",
+            100 + made.point_idx[k],
+            k,
+            *xy[k].tolist(),
+            0.004,
+            1,
+            2,
+            3,
+            -1,
+            -1,
+        )
+        lines.append("\t".join(map(str, words)))
+    return "\n".join(lines) + "\n"
+
+
+def opensfm_files(made: Scene) -> dict[str, bytes]:
+    tracks = f"OPENSFM_TRACKS_VERSION_v2\n{opensfm_tracks(made)}"
+    return {"reconstruction.json": json.dumps([opensfm_part(made)]).encode(), "tracks.csv": tracks.encode()}
+
+
+OPENMVG_LENSES = {
+    "pinhole": (None, ()),
+    "pinhole_radial_k1": ("disto_k1", ("k1",)),
+    "pinhole_radial_k3": ("disto_k3", ("k1", "k2", "k3")),
+    "pinhole_brown_t2": ("disto_t2", ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+
+
+def openmvg_data(made: Scene, kind: str, *, wrapped: bool = False) -> dict:
+    """sfm_data.json as cereal writes it; ``wrapped``: what the base class writes stands in value0."""
+    base = {"width": made.width, "height": made.height, "focal_length": made.lens["fx"]}
+    base |= {"principal_point": [made.lens["cx"], made.lens["cy"]]}
+    key, names = OPENMVG_LENSES[kind]
+    data = {"value0": base} if wrapped else base
+    if key:
+        data = data | {key: [made.lens.get(name, 0.0) for name in names]}
+    ids = range(len(made.rotations))
+    views, extrinsics, structure = [], [], []
+    for row in ids:
+        view = {"local_path": "", "filename": f"{row}.jpg", "width": made.width, "height": made.height}
+        view |= {"id_view": row, "id_intrinsic": 0, "id_pose": row}
+        pointer = {"id": 2147483649 + row, "data": view}
+        views.append({"key": row, "value": {"polymorphic_id": 1073741824, "ptr_wrapper": pointer}})
+    for row, (rotation, centre) in enumerate(zip(made.rotations, made.centres, strict=True)):
+        extrinsics.append({"key": row, "value": {"rotation": rotation.tolist(), "center": centre.tolist()}})
+    for row, (xyz, seen) in enumerate(by_point(made)):
+        found = [{"key": int(made.image_idx[k]), "value": {"id_feat": int(k), "x": made.xy[k].tolist()}} for k in seen]
+        structure.append({"key": row, "value": {"X": xyz, "observations": found}})
+    value = {"polymorphic_id": 2147483649, "polymorphic_name": kind, "ptr_wrapper": {"id": 2147483700, "data": data}}
+    out = {"sfm_data_version": "0.3", "root_path": "images", "views": views, "intrinsics": [{"key": 0, "value": value}]}
+    return out | {"extrinsics": extrinsics, "structure": structure, "control_points": []}
+
+
+def openmvg_files(made: Scene, kind: str = "pinhole_radial_k3", *, wrapped: bool = False) -> dict[str, bytes]:
+    return {"sfm_data.json": json.dumps(openmvg_data(made, kind, wrapped=wrapped)).encode()}

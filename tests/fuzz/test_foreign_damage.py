@@ -22,6 +22,8 @@ FILES = {
     "bundler": fs.bundler_files(TINY),
     "bal": fs.bal_files(TINY),
     "nvm": fs.nvm_files(TINY, 0.05),
+    "opensfm": fs.opensfm_files(TINY),
+    "openmvg": fs.openmvg_files(TINY, "pinhole_radial_k1"),
 }
 CASES = [(name, file) for name, files in FILES.items() for file in files]
 DAMAGE = settings(
