@@ -273,6 +273,10 @@ class SparseModel:
     observations: ObservationTable
     findings: tuple[Finding, ...]
 
+    def __repr__(self) -> str:
+        sizes = f"{len(self.images)} images, {len(self.cameras)} cameras, {len(self.points)} points"
+        return f"<SparseModel {self.location!r}, {self.file_format}: {sizes}, {len(self.observations)} observations>"
+
     def camera(self, camera_idx: int) -> CameraRecord:
         """Return the camera in row ``camera_idx`` of the camera table."""
         table = self.cameras
@@ -350,6 +354,9 @@ class InlierSet:
     num_dangling: int = 0
     num_behind: int = 0
     num_nonfinite: int = 0
+
+    def __repr__(self) -> str:
+        return f"<InlierSet of {self.image.name!r}: {len(self.xy_px)} inliers>"
 
 
 def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:

@@ -1,13 +1,21 @@
-"""The one function that reads a model, whatever its format."""
+"""The functions that read a model: of files, whatever their format, and of a reconstruction in memory."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from sfm_audit.loaders.assembly.assemble import assemble
+from sfm_audit.loaders.colmap import in_memory
 from sfm_audit.loaders.formats import format_of
 from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.paths.locations import parse_location
+
+if TYPE_CHECKING:
+    import pycolmap
+
+IN_MEMORY: Final = "pycolmap"
+"""``file_format`` of a model that no files were read for."""
 
 
 def open_model(path: str | Path) -> SparseModel:
@@ -34,3 +42,25 @@ def open_model(path: str | Path) -> SparseModel:
     folder = parse_location(path)
     model_format = format_of(folder)
     return assemble(model_format.read(folder), str(path), model_format.name)
+
+
+def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> SparseModel:
+    """Take a model out of a reconstruction in memory, without files.
+
+    Parameters
+    ----------
+    reconstruction : its registered images, with cameras, rigs, frames and points; nothing in it is changed, and what is
+        changed in it afterwards does not change the model
+
+    Returns
+    -------
+    SparseModel
+        Equal to what `open_model` reads where ``reconstruction.write_binary`` wrote, findings included;
+        ``file_format`` is "pycolmap", ``location`` says that it lies in memory.
+
+    Raises
+    ------
+    LoadError
+        A camera model or an image size that the tables do not know.
+    """
+    return assemble(in_memory.raw_model(reconstruction), in_memory.WHERE, IN_MEMORY)

@@ -8,6 +8,7 @@ name is taken; in a checkout they are links to the folders above.
 from __future__ import annotations
 
 import importlib
+import zlib  # noqa: F401 - before pycolmap 4.2, whose own zlib otherwise serves Pillow 13 too, and pictures crash
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,14 +16,16 @@ if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
     from sfm_audit.audit.decision.decide import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
-    from sfm_audit.audit.engine.model import ModelAuditor
-    from sfm_audit.audit.engine.model import audit_model as audit_reconstruction
+    from sfm_audit.audit.engine.model import ModelAuditor, audit_model
     from sfm_audit.audit.engine.tables import ModelAudit
+    from sfm_audit.audit.notebook.correspondences import audit_correspondences
+    from sfm_audit.audit.notebook.reconstruction import audit_reconstruction
+    from sfm_audit.audit.notebook.result import ImageResult, ReconstructionAudit
     from sfm_audit.audit.table import ModelLabels
     from sfm_audit.audit.table.words import Reason, ReasonCode, Verdict
     from sfm_audit.loaders.errors import LoadError
     from sfm_audit.loaders.model import SparseModel
-    from sfm_audit.loaders.opening import open_model
+    from sfm_audit.loaders.opening import from_pycolmap, open_model
 
 __version__: str  # asked of the installed metadata: it stands in pyproject.toml only
 
@@ -30,16 +33,21 @@ __all__ = [
     "AuditConfig",
     "Decision",
     "ImageAudit",
+    "ImageResult",
     "LoadError",
     "ModelAudit",
     "ModelAuditor",
     "ModelLabels",
     "Reason",
     "ReasonCode",
+    "ReconstructionAudit",
     "SparseModel",
     "Verdict",
+    "audit_correspondences",
     "audit_inliers",
+    "audit_model",
     "audit_reconstruction",
+    "from_pycolmap",
     "open_model",
 ]
 
@@ -56,10 +64,14 @@ _HOMES: Final = {
     "SparseModel": "loaders.model",
     "Verdict": "audit.table.words",
     "audit_inliers": "audit.engine.image",
-    "audit_reconstruction": "audit.engine.model",
+    "audit_model": "audit.engine.model",
+    "audit_correspondences": "audit.notebook.correspondences",
+    "audit_reconstruction": "audit.notebook.reconstruction",
+    "ImageResult": "audit.notebook.result",
+    "ReconstructionAudit": "audit.notebook.result",
+    "from_pycolmap": "loaders.opening",
     "open_model": "loaders.opening",
 }
-_RENAMED: Final = {"audit_reconstruction": "audit_model"}
 
 if not all((Path(__file__).parent / room).is_dir() for room in ("audit", "loaders", "reports")):
     raise ImportError(
@@ -79,7 +91,7 @@ if not TYPE_CHECKING:  # a type checker would take every misspelt name for Any
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
-        value = getattr(module, _RENAMED.get(name, name))
+        value = getattr(module, name)
         globals()[name] = value
         return value
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map, median_depth
-from sfm_audit.audit.cli.recompute import image_residuals_of, tau_px
+from sfm_audit.audit.cli.recompute import tau_px
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.misfit import MisfitGroup, prepare_image
+from sfm_audit.audit.notebook.pictures import image_residuals_of
+from sfm_audit.audit.notebook.story import explained_field, xyz_cam_of
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.reports import figures
@@ -35,7 +35,7 @@ def tell(auditor: ModelAuditor, image_idx: int) -> ToldImage:
     with threadpool_limits(limits=1, user_api="blas"):
         row = _row(auditor, image_idx)
         residuals = image_residuals_of(auditor, image_idx, row)
-        field_px = _explained_field(auditor, image_idx, row)
+        field_px = explained_field(auditor, image_idx, row)
         error_px = _expected_error(auditor, image_idx, row)
     config = auditor.config.model_dump()
     drawn = _figures(row, config, residuals, field_px, error_px)
@@ -53,31 +53,16 @@ def _row(auditor: ModelAuditor, image_idx: int) -> dict[str, Any]:
     return row
 
 
-def _explained_field(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> FloatArray | None:
-    """What the named misfit explains of the residuals (n, 2), on the model as it stands; None without one."""
-    camera = auditor.model.image(image_idx).camera
-    if camera is None or row["misfit_group"] is None:
-        return None
-    residuals_px = auditor.residuals.residuals_px[:, auditor.residuals.rows(image_idx)]
-    prepared = prepare_image(camera, _xyz_cam(auditor, image_idx))
-    field_px = prepared.explained_px(residuals_px, MisfitGroup(row["misfit_group"]))
-    return field_px.T if np.isfinite(field_px).all() else None
-
-
 def _expected_error(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> FloatArray | None:
     """Expected measurement error over the image, px; None without a camera or with too little to tell."""
     camera, sigma_px = auditor.model.image(image_idx).camera, row["sigma_constant_px"]
     if camera is None or row["expected_error_px"] is None:
         return None
-    quality, xyz_cam = auditor.quality[image_idx], _xyz_cam(auditor, image_idx)
+    quality, xyz_cam = auditor.quality[image_idx], xyz_cam_of(auditor, image_idx)
     if quality is None:
         return None
     depth = median_depth(camera, xyz_cam)
     return expected_error_map(camera, quality.identifiability.parameters, sigma_px, depth).error_px
-
-
-def _xyz_cam(auditor: ModelAuditor, image_idx: int) -> FloatArray:
-    return auditor.model.image(image_idx).cam_from_world(auditor.inliers(image_idx).xyz_world)
 
 
 def _figures(

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
-from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.notebook.pictures import image_residuals_of
 from sfm_audit.audit.table.thresholds import effect_px
 from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
@@ -19,6 +19,8 @@ from sfm_audit.loaders.formats import keypoint_scales_of
 from sfm_audit.loaders.paths.locations import RemotePath, parse_location
 from sfm_audit.reports.charts import ResidualError, Residuals
 from sfm_audit.reports.charts.residuals import principal_point, residuals_of_row
+from sfm_audit.reports.figures import ResidualError, Residuals
+from sfm_audit.reports.figures.residuals import residuals_of_row
 from sfm_audit.reports.run_folder.reader import RunReader
 
 _OTHER_MACHINES: Final = ("//", "\\\\")  # opening such a path sends the user's name to a host, on Windows
@@ -117,22 +119,6 @@ def auditor_of(model: SparseModel, config: AuditConfig) -> ModelAuditor:
     """
     return ModelAuditor(
         model, config, keypoint_scales_of(model, model.location) if config.noise == "keypoint" else None
-    )
-
-
-def image_residuals_of(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> Residuals:
-    """Return what the figures need of the image in row ``image_idx`` of the model; ``row``: of ``RUN/images``."""
-    with threadpool_limits(limits=1, user_api="blas"):
-        _, z = auditor.standardised(image_idx)
-        inliers = auditor.inliers(image_idx)
-        residuals_px = auditor.residuals.residuals_px[:, auditor.residuals.rows(image_idx)].T
-    return Residuals.build(
-        inliers.xy_px,
-        residuals_px,
-        z=z,
-        size_px=(row["width"], row["height"]) if row["width"] else None,
-        centre_px=principal_point(row),
-        sigma_px=row["sigma_constant_px"],
     )
 
 

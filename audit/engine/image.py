@@ -100,6 +100,11 @@ class ImageAudit:
     implied: Mapping[str, float] = field(default_factory=dict)
     outside: Mapping[str, object] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        codes = ", ".join(dict.fromkeys(reason.code for reason in self.reasons))
+        why = f" ({codes})" if codes else ""
+        return f"<ImageAudit of {self.image.name!r}: {self.verdict}{why}, {len(self.residuals_px)} inliers>"
+
     @property
     def image(self) -> ImageRecord:
         """The image that was audited."""

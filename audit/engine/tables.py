@@ -25,6 +25,9 @@ class ModelAudit:
     models: pa.Table
     observations: pa.Table | None = None
 
+    def __repr__(self) -> str:
+        return f"<ModelAudit: {', '.join(f'{name} {table.num_rows} rows' for name, table in self.tables.items())}>"
+
     @property
     def tables(self) -> dict[str, pa.Table]:
         """The tables by name."""

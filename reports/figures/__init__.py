@@ -17,7 +17,13 @@ from sfm_audit.reports.figures.runs import (
     noise_comparison,
     verdict_bars,
 )
-from sfm_audit.reports.figures.sensor import inliers_on_photo, radial_profile, residual_field, residual_vectors
+from sfm_audit.reports.figures.sensor import (
+    draw_residual_vectors,
+    inliers_on_photo,
+    radial_profile,
+    residual_field,
+    residual_vectors,
+)
 from sfm_audit.reports.figures.style import VERDICT_COLOURS
 
 __all__ = [
@@ -26,6 +32,7 @@ __all__ = [
     "ResidualError",
     "Residuals",
     "RunColumns",
+    "draw_residual_vectors",
     "expected_error",
     "histogram_by_verdict",
     "inliers_on_photo",

@@ -43,16 +43,24 @@ def residual_vectors(
     what : what the arrows are, for the title
     """
     figure, axes = _image_axes(residuals)
+    draw_residual_vectors(axes, residuals, max_vectors=max_vectors, magnify=magnify, what=what)
+    return figure
+
+
+def draw_residual_vectors(
+    axes: Axes, residuals: Residuals, *, max_vectors: int = 300, magnify: float | None = None, what: str = "residuals"
+) -> None:
+    """Draw the same into axes of the caller's, which get the image's frame; their style is left alone."""
+    _frame(axes, residuals)
     if not len(residuals):
         say_nothing_to_show(axes, _NOBODY)
-        return figure
+        return
     chosen = evenly(len(residuals), max_vectors)
     length = np.hypot(*residuals.residual_px.T)
     factor = magnify or magnification(float(np.quantile(length, 0.9)), max(residuals.size_px))
     _arrows(axes, residuals.xy_px[chosen], residuals.residual_px[chosen], factor, BLUE)
     shown = what if len(chosen) == len(residuals) else f"{len(chosen)} of {len(residuals)} {what}"
     axes.set_title(f"{shown}, × {factor:g}")
-    return figure
 
 
 @styled
@@ -152,6 +160,12 @@ def _image_axes(residuals: Residuals, space_in: float = 0.0) -> tuple[Figure, Ax
     """Return axes with the image's frame: x to the right, y down, equal scale; ``space_in`` for a colour bar below."""
     width, height = (float(max(size, 1.0)) for size in residuals.size_px)
     figure, axes = new_axes(WIDTH_IN, min(_MAX_HEIGHT_IN, 0.55 + space_in + 2.9 * min(height / width, 1.4)))
+    _frame(axes, residuals)
+    return figure, axes
+
+
+def _frame(axes: Axes, residuals: Residuals) -> None:
+    width, height = (float(max(size, 1.0)) for size in residuals.size_px)
     axes.set_xlim(0.0, width)
     axes.set_ylim(height, 0.0)
     axes.set_aspect("equal")
@@ -159,7 +173,6 @@ def _image_axes(residuals: Residuals, space_in: float = 0.0) -> tuple[Figure, Ax
     axes.set_yticks([0.0, height])
     for spine in axes.spines.values():
         spine.set_visible(True)
-    return figure, axes
 
 
 def _arrows(
