@@ -65,7 +65,7 @@ SOUND = Diagnostics(
     has_own=True,
     gains=Gains(pose=1.0, camera=1.0, both=5.0),
 )
-EXACT_PX = 1600 * 2.0**-23
+EXACT_PX = 1600 * 2.0**-16
 
 MATERIAL = group(q=0.01, px=0.3, gain=10.0)
 NOT_TESTED = group(q=NAN, px=NAN, gain=-math.inf, status=MisfitStatus.NOT_ENOUGH_EVIDENCE)

@@ -50,8 +50,12 @@ def _group(test: JointTest, num_observations: int) -> GroupDiagnostics:
 
 
 def consistency_diagnostics(image: ImageConsistency, *, all_behind: bool) -> ConsistencyDiagnostics:
-    """Return what is known of the parts of an image."""
+    """Return what is known of the parts of an image; ``all_behind``: all observations of the model are.
+
+    An image with too few observations to be called inconsistent, all of them behind it, says so by itself.
+    """
     text = "" if image.explanation is None else image.explanation.text
+    all_behind = all_behind or (image.inconsistent is None and image.num_linked > 0 and image.share_in_front == 0.0)
     if all_behind:
         text = f"all {image.num_linked} observations lie behind the camera: axes flipped, or poses inverted?"
     return ConsistencyDiagnostics(image.inconsistent, text, image.rms_px, all_behind)

@@ -39,8 +39,9 @@ KS_CRITICAL: Final = 1.36
 """Times 1 / sqrt(N): the 5 % point of the Kolmogorov-Smirnov distance."""
 MIN_OWN_STEP_SDS: Final = 5.0
 """An own parameter's step counts from so many of its standard deviations on (method.md section 11)."""
-EXACT_SHARE: Final = 2.0**-23
-"""Residuals below this share of the longer side of the image are rounding of float32, not measurement."""
+EXACT_SHARE: Final = 2.0**-16
+"""Residuals below this share of the longer side of the image are rounding of float32, not measurement: points and poses
+kept in float32 leave up to 9e-6 of it, measurements at least 4e-4 (scripts/exact_projections.py)."""
 SINGULAR_SHARE: Final = 1e-9
 """Share of the largest singular value (columns of unit length) at or below which nothing is identified."""
 HALF_PIXEL_SHIFT_PX: Final = 0.5**0.5

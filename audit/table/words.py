@@ -238,7 +238,8 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
     ),
     ReasonCode.MISSING_CAMERA: _leaves_open("the model has no camera of this id: the id", *_ALL),
     ReasonCode.EXACT_PROJECTIONS: _leaves_open(
-        "the 2D points are projections of the 3D points, not measurements: largest residual",
+        "the 2D points are projections of the 3D points, not measurements (feed-forward networks write such): "
+        "largest residual",
         *(Member.MISFIT, Member.CAMERA, Member.NOISE, Member.KS),
     ),
     ReasonCode.NOISE_NOT_FITTED: _leaves_open(
@@ -299,7 +300,8 @@ REASONS: Final[dict[ReasonCode, ReasonWords]] = {
         Member.CAMERA,
     ),
     ReasonCode.POINTS_BEHIND: _leaves_open(
-        "all observations of the model lie behind their cameras: axes flipped, or poses inverted?", *_ALL
+        "all observations of the model, or all of the few of the image, lie behind: axes flipped, or poses inverted?",
+        *_ALL,
     ),
     ReasonCode.CAMERA_NOT_OPTIMAL: _rejects(
         "a parameter of the camera is not where adjusting everything would put it: stored and implied value, sd, px",

@@ -29,6 +29,8 @@ from sfm_audit.loaders.assembly.raw import (
     image_columns,
 )
 from sfm_audit.loaders.camera_models import BY_NAME, COLMAP_MODELS
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.colmap.last_record import check_last_image, check_last_point
 from sfm_audit.loaders.colmap.text_points import read_points
 from sfm_audit.loaders.errors import Position
 from sfm_audit.loaders.model import CameraTable, Finding
@@ -74,12 +76,14 @@ def read_model(folder: InputPath) -> RawModel:
         return not bool(np.isin(images.point3d_id, points.point3d_id).all())
 
     findings = (
-        *check_count(camera_file, "cameras", len(cameras), has_missing=lacks_cameras, needs_line_end=False),
+        *check_count(camera_file, "cameras", len(cameras), has_missing=lacks_cameras),
         *check_count(image_file, "images", len(images.image_id), has_missing=lacks_images),
         *check_count(point_file, POINTS, len(points.order), has_missing=lacks_points),
         *rig_findings,
         *frame_findings,
     )
+    check_last_image(image_file, images, points)
+    check_last_point(point_file, images, points)
     return RawModel(cameras, images, points, rigs, frames, findings)
 
 
@@ -187,7 +191,7 @@ def read_rigs(path: InputPath) -> tuple[tuple[RawRig, ...], tuple[Finding, ...]]
         if rig.rig_id in rigs:
             raise duplicate_id(path, Position("line", line), "rig", rig.rig_id)
         rigs[rig.rig_id] = rig
-    return tuple(rigs.values()), check_count(file, "rigs", len(rigs), has_missing=lambda: True)
+    return tuple(rigs.values()), check_count(file, "rigs", len(rigs), has_missing=lambda: True, needs_line_end=True)
 
 
 class _Fields:
@@ -254,7 +258,9 @@ def read_frames(path: InputPath) -> tuple[tuple[RawFrame, ...], tuple[Finding, .
         if frame.frame_id in frames:
             raise duplicate_id(path, Position("line", line), "frame", frame.frame_id)
         frames[frame.frame_id] = frame
-    return tuple(frames.values()), check_count(file, "frames", len(frames), has_missing=lambda: True)
+    return tuple(frames.values()), check_count(
+        file, "frames", len(frames), has_missing=lambda: True, needs_line_end=True
+    )
 
 
 def _read_frame(fields: _Fields) -> RawFrame:

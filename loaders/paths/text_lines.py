@@ -94,20 +94,21 @@ def _pieces(path: InputPath, advice: str, *, may_be_empty: bool) -> Iterator[byt
 
 
 def check_count(
-    file: TextFile, kind: str, count: int, *, has_missing: Callable[[], bool], needs_line_end: bool = True
+    file: TextFile, kind: str, count: int, *, has_missing: Callable[[], bool], needs_line_end: bool = False
 ) -> tuple[Finding, ...]:
     """Compare the number of records with the number that the file states.
 
     COLMAP and most other writers state the count in a comment and end every line. A file that states more records
     than it holds was cut, or its comment is wrong (public models have such comments): cut, if it holds none, or if
     the other files refer to a record that it does not hold. A cut inside the last number of the last line leaves a
-    shorter, valid number; so a file that states its count, or holds no record, must also end its last line.
+    shorter, valid number: an unended line is a finding, and an error where fewer records than stated stand above it, or
+    where nothing else could tell (``needs_line_end``).
 
     Parameters
     ----------
     file, kind, count : the file, what it lists, and how many of them were read
     has_missing : whether other files refer to records that the file lacks; asked only where that matters
-    needs_line_end : False for a file that people edit by hand: an unended line is a finding there, not an error
+    needs_line_end : whether a file that states its count, or holds no record, must end its last line
 
     Raises
     ------
@@ -120,7 +121,9 @@ def check_count(
     if not file.is_terminated and needs_line_end and (stated is not None or count == 0):
         raise file.truncated("a line end after the last line", "none, so its last number may be cut")
     is_short = stated is not None and count < stated
-    if (is_short and count == 0) or ((is_short or (count == 0 and stated is None)) and has_missing()):
+    if (is_short and (count == 0 or not file.is_terminated)) or (
+        (is_short or (count == 0 and stated is None)) and has_missing()
+    ):
         wanted = f"{stated} {kind}, as its own comment says" if is_short else f"the {kind} that other files refer to"
         raise file.truncated(wanted, f"{count}")
     findings: list[Finding] = []

@@ -61,15 +61,60 @@ def test_the_comments_may_be_missing_and_the_last_line_unended(tmp_path: Path, n
     assert_array_equal(model.observations.point_idx, [1, 0, 2, 0, 1, 2])
 
 
-@pytest.mark.parametrize(("name", "is_refused"), [("cameras.txt", False), ("images.txt", True), ("points3D.txt", True)])
-def test_an_unended_last_line_in_a_file_that_states_its_count(tmp_path: Path, name: str, is_refused: bool):
+@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
+def test_an_unended_last_line_in_a_file_that_states_its_count_is_told(tmp_path: Path, name: str):
+    """Public models have such files: editors write them."""
     write_text(tmp_path, tiny_model().but(images=tiny_model().images[:2]))
     rewrite(tmp_path, name, lambda text: text.removesuffix(b"\n"))
-    if is_refused:
-        with pytest.raises(TruncatedFileError, match="its last number may be cut"):
+    model = open_model(tmp_path)
+    assert [finding.code for finding in model.findings] == [FindingCode.UNTERMINATED_TEXT]
+    assert_array_equal(model.observations.point_idx, [1, 0, 2, 0, 1, 2])
+
+
+@pytest.mark.parametrize("header", [True, False])
+@pytest.mark.parametrize(
+    ("name", "record"), [("images.txt", "image 4"), ("points3D.txt", "3D point 13")], ids=["images", "points"]
+)
+def test_the_last_number_of_an_unended_line_is_checked_against_the_tracks(tmp_path, name, record, header):
+    """A cut of a last number leaves a shorter, valid one; each link is written twice."""
+    points2d = ((1.0, 2.0, 12), (3.0, 4.0, 13))
+    tracks = (Point(12, ((3, 0), (4, 0))), Point(1, ()), Point(13, ((3, 1), (4, 1))))
+    images = (Image(3, "a", points2d), Image(4, "b", points2d))
+    write_text(tmp_path, tiny_model().but(images=images, points=tracks), header=header)
+    rewrite(tmp_path, name, lambda text: text.removesuffix(b"\n"))
+    assert FindingCode.UNTERMINATED_TEXT in {finding.code for finding in open_model(tmp_path).findings}
+    cut = (lambda text: text[:-1]) if name == "images.txt" else (lambda text: text[:-1] + b"0")
+    with pytest.raises(
+        TruncatedFileError, match=rf"expected a line end .* tracks confirm, found neither: {record} has 2 "
+    ):
+        open_model(rewrite(tmp_path, name, cut))
+
+
+@pytest.mark.parametrize("header", [True, False])
+def test_without_any_track_an_unended_line_is_refused_where_a_count_is_stated(tmp_path, header):
+    points = (Point(12), Point(13))
+    images = (Image(3, "a", ((1.0, 2.0, 12), (3.0, 4.0, 13))),)
+    write_text(tmp_path, tiny_model().but(images=images, points=points), header=header)
+    rewrite(tmp_path, "images.txt", lambda text: text.removesuffix(b"\n"))
+    if header:
+        with pytest.raises(TruncatedFileError, match="no 3D point has a track"):
             open_model(tmp_path)
-    else:  # a public model has such a cameras.txt
-        assert [finding.code for finding in open_model(tmp_path).findings] == [FindingCode.UNTERMINATED_TEXT]
+    else:
+        assert FindingCode.UNTERMINATED_TEXT in {finding.code for finding in open_model(tmp_path).findings}
+
+
+@pytest.mark.parametrize("tail", [b"# the end", b"  "], ids=["comment", "blanks"])
+@pytest.mark.parametrize("name", ["images.txt", "points3D.txt"])
+def test_an_unended_comment_cuts_no_record(tmp_path, name, tail):
+    write_text(tmp_path, tiny_model().but(images=tiny_model().images[:2]))
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + tail)
+    assert [finding.code for finding in open_model(tmp_path).findings] == [FindingCode.UNTERMINATED_TEXT]
+
+
+def test_fewer_records_than_stated_and_no_line_end_are_a_cut(folder):
+    rewrite(folder, "points3D.txt", lambda text: text.replace(b"points: 3", b"points: 4").removesuffix(b"\n"))
+    with pytest.raises(TruncatedFileError, match="expected 4 3D points, as its own comment says, found 3"):
+        open_model(folder)
 
 
 @pytest.mark.parametrize("line", [3, 4])
