@@ -37,8 +37,8 @@ def residual_findings(
     if num_exact:
         text = (
             f"the 2D points of {num_exact} images are projections of the 3D points, not measurements: ask whether "
-            "cameras are plausible and points lie in front of them; to ask whether cameras and poses are right, match the "
-            "photos and triangulate (colmap point_triangulator)"
+            "cameras are plausible and points lie in front of them; to ask whether cameras and poses are right, match "
+            "the photos and triangulate (colmap point_triangulator)"
         )
         found.append(Finding(FindingCode.EXACT_PROJECTIONS, num_exact, text))
     elif statistics.removable_sq_px2 > _REMOVABLE_SHARE * statistics.total_sq_px2:
