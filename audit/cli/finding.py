@@ -104,14 +104,14 @@ def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
 def listed(found: Discovery) -> tuple[list[str], list[str]]:
     """Return one line per model, and one per problem.
 
-    A line holds dataset, scene, component, number of images (- where the files do not say), bytes and location,
-    separated by tabs.
+    A line holds dataset, scene, component, number of images (- where the files do not say), bytes, location and the
+    name of the layout, separated by tabs.
     """
     counts = count_images_of([ref.location for ref in found.refs])
     lines = []
     for ref, count in zip(found.refs, counts, strict=True):
         images = UNKNOWN if isinstance(count, LoadError) else str(count)
-        cells = (ref.dataset, ref.scene, ref.component, images, str(ref.num_bytes), ref.model_path)
+        cells = (ref.dataset, ref.scene, ref.component, images, str(ref.num_bytes), ref.model_path, ref.layout)
         lines.append("\t".join(plain(cell) for cell in cells))
     problems = [*found.errors, *(count for count in counts if isinstance(count, LoadError))]
     return lines, [plain(str(problem)) for problem in problems]

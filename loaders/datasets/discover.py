@@ -42,6 +42,7 @@ class ModelRef:
     num_bytes: size of the files that the model is read from.
     stamp: `input_stamp` when the model was found in an object store; empty for local models, which
     are asked again at no cost.
+    layout: name of the rule that gave scene and component, see `layouts.LAYOUTS`.
     """
 
     dataset: str
@@ -51,6 +52,7 @@ class ModelRef:
     model_path: str
     num_bytes: int = field(default=0, compare=False)
     stamp: str = field(default="", compare=False, repr=False)
+    layout: str = field(default="", compare=False)
 
     @property
     def key(self) -> str:
@@ -175,8 +177,9 @@ def _check_root(root: InputPath) -> None:
 
 
 def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef:
+    location = real_location(model_path)
     return ModelRef(
-        dataset, place.scene, place.component, real_location(model_path), model_path, found.num_bytes, found.stamp
+        dataset, place.scene, place.component, location, model_path, found.num_bytes, found.stamp, place.layout
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 Parts = tuple[str, ...]
@@ -12,11 +12,16 @@ ONLY_COMPONENT: Final = "0"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What a model is called. num_below: how many of the names that lead to it lie below the scene's folder."""
+    """What a model is called.
+
+    num_below: how many of the names that lead to it lie below the scene's folder.
+    layout: name of the rule; "" before `place_of` has found it.
+    """
 
     scene: str
     component: str
     num_below: int
+    layout: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +60,43 @@ def _phototourism(parts: Parts) -> Place | None:
     return None
 
 
+_ETH3D: Final = frozenset(
+    {"dslr_calibration_jpg", "dslr_calibration_undistorted", "rig_calibration", "rig_calibration_undistorted"}
+)
+
+
+def _eth3d(parts: Parts) -> Place | None:
+    """ETH3D: one model per camera system and version of the images, all of one scene."""
+    return Place(parts[-2], parts[-1], 1) if len(parts) >= 2 and parts[-1] in _ETH3D else None
+
+
+def _scannetpp(parts: Parts) -> Place | None:
+    """ScanNet++: data/<scene>/dslr/colmap, data/<scene>/iphone/colmap."""
+    if len(parts) >= 3 and parts[-1] == "colmap" and parts[-2] in {"dslr", "iphone"}:
+        return Place(parts[-3], parts[-2], 2)
+    return None
+
+
+def _imc(parts: Parts) -> Place | None:
+    """Image Matching Challenge 2023 (train/<dataset>/<scene>/sfm) and 2024 (train/<scene>/sfm); 2021: phototourism."""
+    if len(parts) >= 3 and parts[-1] == "sfm" and parts[-3] == "train":
+        return Place(parts[-2], ONLY_COMPONENT, 1)
+    if len(parts) >= 4 and parts[-1] == "sfm" and parts[-4] == "train":
+        return Place("/".join(parts[-3:-1]), ONLY_COMPONENT, 1)
+    return None
+
+
+def _visloc(parts: Parts) -> Place | None:
+    """Ground truth of visual localization: Aachen's 3D-models, hloc's models of 7Scenes and Cambridge Landmarks."""
+    if len(parts) >= 3 and parts[-2] == "3D-models":
+        return Place(parts[-3], parts[-1], 2)
+    if len(parts) >= 2 and parts[-1] in {"triangulated", "model_train"}:
+        return Place(parts[-2], parts[-1], 1)
+    return None
+
+
 def _nerfstudio(parts: Parts) -> Place | None:
-    """Nerfstudio, 3D Gaussian splatting."""
+    """Nerfstudio, 3D Gaussian splatting; so lie mip-NeRF 360, Tanks and Temples for NeRF, and what GLOMAP writes."""
     if len(parts) >= 4 and parts[-3:-1] == ("colmap", "sparse"):
         return Place(parts[-4], parts[-1], 3)
     if len(parts) >= 3 and parts[-2:] == ("colmap", "sparse"):
@@ -105,6 +145,10 @@ LAYOUTS: Final[Mapping[str, Layout]] = {
         Layout("megadepth", "<scene>/sparse/manhattan/<component>", _megadepth),
         Layout("megascenes", "AAA/BBB/sparses/<component>, AAA/BBB/colmap/<component>", _megascenes),
         Layout("phototourism", "<scene>/dense/sparse", _phototourism),
+        Layout("eth3d", "<scene>/dslr_calibration_*, <scene>/rig_calibration*", _eth3d),
+        Layout("scannetpp", "<scene>/dslr/colmap, <scene>/iphone/colmap", _scannetpp),
+        Layout("imc", "train/<scene>/sfm, train/<dataset>/<scene>/sfm", _imc),
+        Layout("visloc", "<scene>/3D-models/<component>, <scene>/triangulated, <scene>/model_train", _visloc),
         Layout("nerfstudio", "<scene>/colmap/sparse/<component>, <scene>/sparse/<component>", _nerfstudio),
         Layout("d2net", "<scene>/sparse, <scene>/sparse-txt", _d2net),
         Layout("hloc", "<scene>/sfm*, <scene>/sfm*/models/<k>", _hloc),
@@ -116,10 +160,9 @@ LAYOUTS: Final[Mapping[str, Layout]] = {
 
 def place_of(parts: Parts, layout: Layout | None = None) -> Place | None:
     """Return what the model in the folder with these path parts is called; None where ``layout`` does not know it."""
-    if layout is not None:
-        return layout.place(parts)
-    places = (each.place(parts) for each in LAYOUTS.values())
-    return next((place for place in places if place), None)
+    asked = LAYOUTS.values() if layout is None else (layout,)
+    places = ((each.name, each.place(parts)) for each in asked)
+    return next((replace(place, layout=name) for name, place in places if place), None)
 
 
 def folders_to_search(parts: Parts, folders: list[str], *, is_model: bool, layout: Layout | None) -> list[str]:
@@ -161,9 +204,9 @@ def distinct(models: Mapping[Parts, Place]) -> dict[Parts, Place]:
 
 def _by_scene_path(parts: Parts, place: Place) -> Place:
     folder = parts[: max(0, len(parts) - place.num_below)]
-    return Place("/".join(folder) or place.scene, place.component, place.num_below)
+    return replace(place, scene="/".join(folder) or place.scene)
 
 
 def _by_both_paths(parts: Parts, place: Place) -> Place:
     folder = parts[max(0, len(parts) - place.num_below) :]
-    return Place(place.scene, "/".join(folder) or place.component, place.num_below)
+    return replace(place, component="/".join(folder) or place.component)

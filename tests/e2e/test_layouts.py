@@ -8,6 +8,7 @@ from corpus import needs_corpus
 from run_samples import part_times, truncate, write_models
 
 from sfm_audit.audit.cli.main import main
+from sfm_audit.loaders.datasets.layouts import LAYOUTS
 
 FOLDERS = {
     "MegaDepth/0001/sparse/manhattan/0": ("0001", "0"),
@@ -49,11 +50,15 @@ def scenes(run: str = "RUN") -> set[tuple[str, str]]:
     return set(zip(models["scene"], models["component"], strict=True))
 
 
+def layout_of(folder: str) -> str:
+    return next(name for name, layout in LAYOUTS.items() if layout.place(("data", *Path(folder).parts)))
+
+
 def test_list_says_what_there_is(capsys, model):
     num_bytes = sum(file.stat().st_size for file in model.glob("*.bin"))
     rows = listed(capsys, "data")
     assert sorted(rows) == sorted(
-        ["data", scene, component, "5", str(num_bytes), f"data/{folder}"]
+        ["data", scene, component, "5", str(num_bytes), f"data/{folder}", layout_of(folder)]
         for folder, (scene, component) in FOLDERS.items()
     )
     assert not Path("RUN").exists()

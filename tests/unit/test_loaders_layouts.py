@@ -23,6 +23,24 @@ KNOWN = [
     ("hloc", "outputs/aachen/sfm_superpoint+superglue", "aachen", "sfm_superpoint+superglue"),
     ("hloc", "outputs/aachen/sfm_superpoint+superglue/models/1", "aachen", "sfm_superpoint+superglue/1"),
     ("hloc", "outputs/demo/sfm", "demo", "sfm"),
+    ("eth3d", "courtyard/dslr_calibration_undistorted", "courtyard", "dslr_calibration_undistorted"),
+    ("eth3d", "courtyard/dslr_calibration_jpg", "courtyard", "dslr_calibration_jpg"),
+    ("eth3d", "delivery_area/rig_calibration", "delivery_area", "rig_calibration"),
+    ("scannetpp", "data/0a5c013435/dslr/colmap", "0a5c013435", "dslr"),
+    ("scannetpp", "data/0a5c013435/iphone/colmap", "0a5c013435", "iphone"),
+    ("imc", "train/church/sfm", "church", "0"),
+    ("imc", "train/heritage/cyprus/sfm", "heritage/cyprus", "0"),
+    ("phototourism", "phototourism/taj_mahal/dense/sparse", "taj_mahal", "0"),
+    ("visloc", "aachen_v1_1/3D-models/aachen_v_1_1", "aachen_v1_1", "aachen_v_1_1"),
+    ("visloc", "7scenes_sfm_triangulated/chess/triangulated", "chess", "triangulated"),
+    (
+        "visloc",
+        "CambridgeLandmarks_Colmap_Retriangulated_1024px/KingsCollege/model_train",
+        "KingsCollege",
+        "model_train",
+    ),
+    ("nerfstudio", "360_v2/bicycle/sparse/0", "bicycle", "0"),
+    ("nerfstudio", "tandt/truck/sparse/0", "truck", "0"),
     ("colmap", "house/dense/2/sparse", "house", "2"),
     ("colmap", "collection/house", "house", "0"),
 ]
@@ -47,6 +65,7 @@ def test_a_layout_is_recognised_and_can_be_forced(tmp_path: Path, layout, folder
     for root in (tmp_path / "data", tmp_path / "data" / folder):
         assert names(discover([root])) == [(scene, component)]
         assert names(discover([root], layout)) == [(scene, component)]
+        assert [ref.layout for ref in discover([root]).refs] == [layout]
 
 
 def test_a_mixed_root_takes_each_model_by_its_own_layout(tmp_path: Path):
