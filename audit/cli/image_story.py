@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map, median_depth
 from sfm_audit.audit.cli.recompute import tau_px
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.notebook.pictures import image_residuals_of
+from sfm_audit.audit.notebook.residuals import image_residuals_of
 from sfm_audit.audit.notebook.story import explained_field, xyz_cam_of
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders.arrays import FloatArray

@@ -11,16 +11,14 @@ from pydantic import ValidationError
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.notebook.pictures import image_residuals_of
+from sfm_audit.audit.notebook.residuals import image_residuals_of
 from sfm_audit.audit.table.thresholds import effect_px
 from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
 from sfm_audit.loaders.formats import keypoint_scales_of
 from sfm_audit.loaders.paths.locations import RemotePath, parse_location
 from sfm_audit.reports.charts import ResidualError, Residuals
-from sfm_audit.reports.charts.residuals import principal_point, residuals_of_row
-from sfm_audit.reports.figures import ResidualError, Residuals
-from sfm_audit.reports.figures.residuals import residuals_of_row
+from sfm_audit.reports.charts.residuals import residuals_of_row
 from sfm_audit.reports.run_folder.reader import RunReader
 
 _OTHER_MACHINES: Final = ("//", "\\\\")  # opening such a path sends the user's name to a host, on Windows

@@ -16,6 +16,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.image import ImageAudit
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.engine.tables import ModelAudit
+from sfm_audit.audit.notebook.residuals import image_residuals_of
 from sfm_audit.audit.notebook.story import story_of
 from sfm_audit.audit.table.words import Verdict
 from sfm_audit.loaders.model import SparseModel
@@ -172,7 +173,7 @@ class ImageResult:
         matplotlib.axes.Axes
             The axes that were drawn into: x to the right, y down, px.
         """
-        from sfm_audit.audit.notebook.pictures import image_residuals_of, plot_residuals  # noqa: PLC0415 - an extra
+        from sfm_audit.audit.notebook.pictures import plot_residuals  # noqa: PLC0415 - needs an extra
 
         with quietly():
             residuals = image_residuals_of(self._auditor, self._image_idx, self.row)

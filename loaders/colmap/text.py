@@ -29,7 +29,6 @@ from sfm_audit.loaders.assembly.raw import (
     image_columns,
 )
 from sfm_audit.loaders.camera_models import BY_NAME, COLMAP_MODELS
-from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.colmap.last_record import check_last_image, check_last_point
 from sfm_audit.loaders.colmap.text_points import read_points
 from sfm_audit.loaders.errors import Position
