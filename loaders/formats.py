@@ -11,6 +11,7 @@ from sfm_audit.loaders.colmap.formats import BINARY, TEXT
 from sfm_audit.loaders.colmap.pairs import database_pairs
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
 from sfm_audit.loaders.foreign.bal import BAL
+from sfm_audit.loaders.foreign.blocks_exchange import BLOCKS_EXCHANGE
 from sfm_audit.loaders.foreign.bundler import BUNDLER
 from sfm_audit.loaders.foreign.nvm import NVM
 from sfm_audit.loaders.foreign.openmvg import OPENMVG
@@ -20,7 +21,7 @@ from sfm_audit.loaders.model_format import ModelFormat, ModelWriter, matching
 from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
 
-FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL)
+FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL, BLOCKS_EXCHANGE)
 """Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
 
 _Value = TypeVar("_Value")

@@ -314,3 +314,55 @@ def openmvg_data(made: Scene, kind: str, *, wrapped: bool = False) -> dict:
 
 def openmvg_files(made: Scene, kind: str = "pinhole_radial_k3", *, wrapped: bool = False) -> dict[str, bytes]:
     return {"sfm_data.json": json.dumps(openmvg_data(made, kind, wrapped=wrapped)).encode()}
+
+
+def tag(name: str, *content: object) -> str:
+    return f"<{name}>{''.join(map(str, content))}</{name}>\n"
+
+
+ORIENTATIONS = {
+    "XRightYDown": np.eye(3),
+    "XRightYUp": np.diag([1.0, -1.0, -1.0]),
+    "XLeftYUp": np.diag([-1.0, -1.0, 1.0]),
+    "XDownYRight": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+
+
+def blocks_exchange_xml(made: Scene, orientation: str = "XRightYDown", system: str = "") -> str:
+    """Bentley's specification: pixels begin at the centre of the first one; P1 and P2 are OpenCV's p2 and p1."""
+    lens = made.lens
+    axes = ORIENTATIONS[orientation]
+    photos = []
+    for row, (rotation, centre) in enumerate(zip(made.rotations, made.centres, strict=True)):
+        matrix = axes @ rotation
+        numbers = [tag(f"M_{i}{j}", repr(float(matrix[i, j]))) for i in range(3) for j in range(3)]
+        at = [tag(axis, repr(value)) for axis, value in zip("xyz", centre.tolist(), strict=True)]
+        pose = tag("Pose", tag("Rotation", *numbers), tag("Center", *at))
+        photos.append(tag("Photo", tag("Id", row), tag("ImagePath", f"{row}.jpg"), pose))
+    names = {"K1": "k1", "K2": "k2", "K3": "k3", "P1": "p2", "P2": "p1"}
+    group = [
+        tag("ImageDimensions", tag("Width", made.width), tag("Height", made.height)),
+        tag("FocalLengthPixels", repr(lens["fx"])),
+        tag("AspectRatio", repr(lens["fy"] / lens["fx"])),
+        tag("CameraOrientation", orientation),
+        tag("PrincipalPoint", *(tag(axis, repr(float(lens[f"c{axis}"]) - 0.5)) for axis in "xy")),
+        tag("Distortion", *(tag(theirs, repr(lens.get(ours, 0.0))) for theirs, ours in names.items())),
+    ]
+    ties = []
+    for xyz, rows in by_point(made):
+        seen = [
+            tag(
+                "Measurement",
+                tag("PhotoId", made.image_idx[k]),
+                *(tag(a, repr(v - 0.5)) for a, v in zip("xy", xy, strict=True)),
+            )
+            for k, xy in zip(rows, made.xy[rows].tolist(), strict=True)
+        ]
+        position = tag("Position", *(tag(axis, repr(value)) for axis, value in zip("xyz", xyz, strict=True)))
+        ties.append(tag("TiePoint", position, *seen))
+    block = tag("Block", system, tag("Photogroups", tag("Photogroup", *group, *photos)), tag("TiePoints", *ties))
+    return f'<?xml version="1.0" encoding="utf-8"?>\n<BlocksExchange version="2.1">\n{block}</BlocksExchange>\n'
+
+
+def blocks_exchange_files(made: Scene, orientation: str = "XRightYDown") -> dict[str, bytes]:
+    return {"BlocksExchange.xml": blocks_exchange_xml(made, orientation).encode()}

@@ -23,6 +23,7 @@ FILES = {
     "bal": fs.bal_files(TINY),
     "nvm": fs.nvm_files(TINY, 0.05),
     "opensfm": fs.opensfm_files(TINY),
+    "blocks_exchange": fs.blocks_exchange_files(TINY),
     "openmvg": fs.openmvg_files(TINY, "pinhole_radial_k1"),
 }
 CASES = [(name, file) for name, files in FILES.items() for file in files]

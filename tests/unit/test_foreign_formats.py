@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.loaders import FindingCode, LoadError, discover, open_model
 from sfm_audit.loaders.datasets.image_counts import count_images
-from sfm_audit.loaders.foreign import json_file
+from sfm_audit.loaders.foreign import json_file, xml_file
 
 IDENTITY = {"dataset", "scene", "component", "model_path", "image_id", "camera_id", "image_name"}
 IDENTITY |= {"file_format", "findings"}
@@ -34,6 +34,7 @@ FORMATS = {
     "opensfm opencv": ("opensfm", fs.opensfm_files, BROWN | {"k3": 0.0}, "perspective", "OPENCV", False),
     "opensfm fisheye": ("opensfm", fs.opensfm_files, {}, "fisheye", "RADIAL_FISHEYE", False),
     "opensfm panorama": ("opensfm", fs.opensfm_files, {}, "spherical", "EQUIRECTANGULAR", False),
+    "blocks": ("blocks_exchange", fs.blocks_exchange_files, {"cx": 4.0}, "perspective", "RADIAL", False),
     "openmvg pinhole": ("openmvg", openmvg("pinhole"), PLAIN, "perspective", "SIMPLE_PINHOLE", False),
     "openmvg k1": ("openmvg", openmvg("pinhole_radial_k1"), {"k2": 0.0}, "perspective", "SIMPLE_RADIAL", False),
     "openmvg k3": ("openmvg", openmvg("pinhole_radial_k3", wrapped=True), {"cx": 4.0}, "perspective", "RADIAL", False),
@@ -172,6 +173,7 @@ def test_what_is_wrong_with_a_bundler_file_is_said_in_one_line(tmp_path, name, o
 
 OTHER_LENSES = {
     "opensfm brown": (fs.opensfm_files, BROWN, "BROWN", "FULL_OPENCV"),
+    "blocks brown": (fs.blocks_exchange_files, BROWN, "BROWN", "FULL_OPENCV"),
     "openmvg brown": (
         openmvg("pinhole_brown_t2"),
         {"p1": 1e-3, "p2": -2e-3, "k3": 0.004},
@@ -298,3 +300,74 @@ def test_a_json_file_with_too_many_values_is_refused_before_it_is_parsed(tmp_pat
     monkeypatch.setattr(json_file, "MAX_BYTES", 1000)
     with pytest.raises(LoadError, match="at most 1000 bytes of JSON"):
         open_model(fs.write(tmp_path, fs.openmvg_files(fs.scene())))
+
+
+@pytest.mark.parametrize("orientation", fs.ORIENTATIONS)
+def test_axes_of_a_photogroup_are_those_it_names(tmp_path, orientation):
+    made = fs.scene()
+    model = open_model(fs.write(tmp_path, fs.blocks_exchange_files(made, orientation)))
+    assert_allclose(residuals_of(model)[1], by_image(made, fs.residuals(made)), atol=1e-8)
+
+
+SYSTEMS = fs.tag("SpatialReferenceSystems", fs.tag("SRS", fs.tag("Id", 0), fs.tag("Definition", "EPSG:4326")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "<BlocksExchange version",
+            "<!DOCTYPE a [<!ENTITY b 'c'>]>\n<BlocksExchange version",
+            "without a document type",
+        ),
+        ("0.jpg", "&b;", "undefined entity"),
+        ("<BlocksExchange version", "<Other version", "<BlocksExchange> as the outermost element, found <Other>"),
+        ("<Block>", "<a>" * 100, "at most 64 elements inside each other"),
+        ("0.jpg", "0" * 70_000, "at most 65536 characters in <ImagePath>"),
+        ("<Id>1</Id>", "<Id>0</Id>", "Id that the file has not used before, found 0 again"),
+        ("<Id>1</Id>", "<Id>-1</Id>", "a whole number below 2^32 in <Id> of <Photo>, found '-1'"),
+        ("<M_00>", "<Omega>1</Omega><N_00>", "mismatched tag"),
+        (
+            "<CameraOrientation>XRightYDown",
+            "<CameraOrientation>XRightYRight",
+            "a CameraOrientation such as XRightYDown",
+        ),
+        ("<AspectRatio>", "<Skew>0.1</Skew><AspectRatio>", "no Skew, found 0.1"),
+        ("<AspectRatio>", "<CameraModelType>Fisheye</CameraModelType><AspectRatio>", "CameraModelType Perspective"),
+        ("<Block>", f"{SYSTEMS}<Block><SRSId>0</SRSId>", "coordinates in metres, found degrees ('EPSG:4326')"),
+        ("<Block>", "<Block></Block><Block>", "one block, found another one"),
+    ],
+)
+def test_what_is_wrong_with_a_block_is_said_in_one_line(tmp_path, old, new, message):
+    xml = fs.blocks_exchange_xml(fs.scene())
+    assert old in xml
+    folder = fs.write(tmp_path, {"my BlocksExchange 2.xml": xml.replace(old, new, 1).encode()})
+    with pytest.raises(LoadError, match=re.escape(message)) as error:
+        open_model(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_millimetres_photos_without_a_pose_and_points_without_a_position(tmp_path):
+    made = fs.scene()
+    xml = fs.blocks_exchange_xml(made)
+    mm = fs.tag("FocalLength", 24.0) + fs.tag("SensorSize", repr(24.0 / made.lens["fx"] * max(made.width, made.height)))
+    xml = re.sub("<FocalLengthPixels>.*</FocalLengthPixels>\n", mm, xml)
+    xml = re.sub("<Pose>.*?</Pose>\n", "", xml, count=1, flags=re.DOTALL)
+    xml = re.sub("<Position>.*?</Position>\n", "", xml, count=1, flags=re.DOTALL)
+    model = open_model(fs.write(tmp_path, {"BlocksExchange.xml": xml.encode()}))
+    assert model.images.image_id.tolist() == [1, 2, 3, 4, 5]
+    assert len(model.points) == 79
+    kept = (made.image_idx > 0) & (made.point_idx > 0)
+    assert_allclose(residuals_of(model)[1], by_image(made, fs.residuals(made))[by_image(made, kept)], atol=1e-8)
+    assert model.images.num_points2d.sum() == np.count_nonzero(made.image_idx > 0)
+
+
+def test_blanks_between_elements_do_not_add_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(xml_file, "MAX_TEXT", 40)
+    assert len(open_model(fs.write(tmp_path, fs.blocks_exchange_files(fs.scene()))).points) == 80
+
+
+def test_bytes_of_an_xml_file_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(xml_file, "MAX_BYTES", 1000)
+    with pytest.raises(LoadError, match="at most 1000 bytes of XML"):
+        open_model(fs.write(tmp_path, fs.blocks_exchange_files(fs.scene())))
