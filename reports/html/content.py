@@ -97,7 +97,8 @@ def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
     content.rows = [row for _, _, row in sorted(worst)]
     content.numbers = {name: np.concatenate([np.empty(0), *values]) for name, values in chunks.items()}
     _read_cameras(content)
-    content.models = list(run.rows("models", [column.name for column in TABLES["models"]]))
+    blank = dict.fromkeys(column.name for column in TABLES["models"])  # for columns that an older run does not have
+    content.models = [blank | row for row in run.rows("models", list(blank))]
     return content
 
 

@@ -20,6 +20,7 @@ from sfm_audit.reports.text.wording import natural_key, plain
 
 MAX_VIEWS: Final = 12
 MAX_VIEWED_IMAGES: Final = 10_000  # of all views together
+_LONG: Final = 200.0  # units: a scene that both views show as a strip has the width of the page
 _NEIGHBOURS: Final = 12  # of each image, kept for a click
 _LINKS: Final = 2  # of each image, drawn at once
 _MATRIX: Final = 240  # cells along a side
@@ -38,7 +39,7 @@ class ModelView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnView:
-    """A model on the page. data: what the script needs to answer a click, as JSON holds it.    alone: no pairs."""
+    """A model on the page. data: what the script needs to answer a click, as JSON holds it.    long: a strip."""
 
     title: str
     missing: str | None
@@ -49,6 +50,7 @@ class DrawnView:
     outside: int = 0
     num_images: int = 0
     num_alone: int = 0
+    long: bool = False
     data: Mapping[str, Any] | None = None
 
 
@@ -74,6 +76,7 @@ def draw_view(shown: ModelView, rows: Sequence[Row]) -> DrawnView:
         int(placed.outside.sum()),
         len(view),
         alone,
+        max(placed.heights) < _LONG,
         {
             "rows": at,
             "top": _numbers(placed.top),
