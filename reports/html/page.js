@@ -16,7 +16,7 @@
     if (kind in digits) return Math.abs(value) < 1000 ? value.toFixed(digits[kind]) : value.toPrecision(3);
     return String(value);
   }
-  const photo = (i) => (payload.thumbnails[i] ? `<img class="thumb" src="${payload.thumbnails[i]}" alt="" loading="lazy">` : "");
+  const photo = (i) => (payload.thumbnails[i] ? `<img class="thumb" src="${payload.thumbnails[i]}" alt="">` : "");
 
   function cell(kind) {
     return (value, type, row) => {
@@ -145,17 +145,9 @@
   byId("panel-scene").addEventListener("click", (event) => { dialog.close(); window.scene.show(opened); event.preventDefault(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
 
-  // paper shows what is folded, and the rows that the filters leave
-  let folded = [], length = 25;
-  window.addEventListener("beforeprint", () => {
-    folded = [...document.querySelectorAll("details:not([open])")];
-    for (const details of folded) details.open = true;
-    length = table.page.len();
-    table.page.len(MAX_PRINTED).draw();
-  });
-  window.addEventListener("afterprint", () => {
-    for (const details of folded) details.open = false;
-    table.page.len(length).draw();
-  });
+  // paper shows what is open on the screen, and the rows that the filters leave
+  let length = 25;
+  window.addEventListener("beforeprint", () => { length = table.page.len(); table.page.len(MAX_PRINTED).draw(); });
+  window.addEventListener("afterprint", () => { table.page.len(length).draw(); });
   document.documentElement.dataset.ready = "true";
 })();
