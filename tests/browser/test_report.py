@@ -2,10 +2,13 @@
 
 import time
 
+import numpy as np
 import pytest
-from report_samples import NASTY_NAMES, browser, needs_chromium, read_sample, screenshot_folder
+from report_samples import NASTY_NAMES, browser, needs_chromium, read_sample, screenshot_folder, write_run
 
+from sfm_audit.audit.cli.main import main
 from sfm_audit.reports import html
+from sfm_audit.reports.charts.scene import SceneView
 from sfm_audit.reports.text.wording import plain
 
 pytestmark = needs_chromium
@@ -24,8 +27,9 @@ def page_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     content = html.read_content(read_sample(folder / "RUN", 60, names=NASTY_NAMES))
     pictures = [html.ImagePictures(missing="No pictures: a test.")] * 3
+    views = [html.ModelView(content.rows[0]["part"], "a/0", ring(60))]
     path = folder / "report.html"
-    path.write_text(html.render_page(html.PageInput(content, pictures)), encoding="utf-8")
+    path.write_text(html.render_page(html.PageInput(content, pictures, views=views)), encoding="utf-8")
     return path
 
 
@@ -48,6 +52,16 @@ def page(chromium, page_file):
     assert problems == []
     assert opened.evaluate("window.hacked") is None
     context.close()
+
+
+def ring(n):
+    """Cameras on a circle, each sharing points with the next."""
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    centre = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    points = np.random.default_rng(0).normal(0, 0.2, (50, 3))
+    pairs = np.column_stack([np.arange(n - 1), np.arange(1, n)])
+    up = np.tile([0.0, 0.0, 1.0], (n, 1))
+    return SceneView(np.arange(n) + 1, centre, -centre, up, points, pairs, np.full(n - 1, 7))
 
 
 def column(page, title):
@@ -111,6 +125,67 @@ def test_from_the_panel_to_the_pictures(page):
     assert page.evaluate("document.activeElement.parentElement.id") == "worst-1"
     page.locator("button.open").nth(5).click()
     assert not page.locator("#panel-pictures").is_visible()
+
+
+def test_a_click_on_a_reason_a_verdict_or_a_camera_shows_its_images(page):
+    page.locator('a.ask[data-ask="reason"]', has_text="misfit").first.click()
+    wait_for_rows(page, "filtered")
+    assert page.evaluate("document.activeElement.id") == "images-heading"
+    assert all("misfit radial" in text for text in column(page, "Why"))
+    page.locator('.totals a.ask[data-value="accepted"]').click()
+    page.locator("#images tbody td.verdict", has_text="accepted").first.wait_for()
+    assert {text.lstrip("\u2713\u2009") for text in column(page, "Verdict")} == {"accepted"}
+
+
+def test_a_camera_of_the_scene_leads_to_its_neighbours_and_to_its_panel(page):
+    box = page.locator('details[data-view="0"]')
+    box.get_by_role("button", name="Next camera").click()
+    words = box.get_by_role("status").inner_text()
+    assert "shares points with" in words
+    assert box.locator(".top .picked circle").count() >= 2
+    first = words
+    x, y = page.evaluate("[...JSON.parse(document.getElementById('payload').textContent).views[0].top.slice(80, 82)]")
+    svg = box.locator(".top svg")
+    scale = svg.bounding_box()["width"] / 560
+    svg.click(position={"x": x * scale, "y": y * scale})
+    assert box.get_by_role("status").inner_text() != first
+    assert "(7)" in box.get_by_role("status").inner_text()
+    box.get_by_role("button", name="Open its panel").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_role("link", name="Show it in the scene").click()
+    dialog.wait_for(state="hidden")
+    assert page.evaluate("document.activeElement.closest('details').dataset.view") == "0"
+
+
+def test_paper_splits_no_row_and_shows_all_rows_that_the_filters_leave(page):
+    page.emulate_media(media="print", color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.querySelector('#images tbody tr')).breakInside") == "avoid"
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert page.locator("#images tbody tr").count() == 60
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert page.locator("#images tbody tr").count() == 25
+
+
+def test_the_page_of_diff(chromium, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.fsync", lambda _: None)
+    for name, seed in (("A", 0), ("B", 3)):
+        write_run(tmp_path / name, 40, names=NASTY_NAMES, seed=seed)
+    args = ["diff", str(tmp_path / "A"), str(tmp_path / "B"), "--html", str(tmp_path / "d.html")]
+    assert main(args) == 0
+    context = chromium.new_context(offline=True, viewport={"width": 390, "height": 900})
+    page = context.new_page()
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.goto((tmp_path / "d.html").as_uri())
+    page.wait_for_selector("html[data-ready]")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.locator('.totals a.ask[data-value="newly rejected"]').click()
+    wait_for_rows(page, "filtered")
+    assert all("newly rejected" in text for text in column(page, "Change"))
+    assert page.evaluate("window.hacked") is None
+    assert problems == []
+    context.close()
 
 
 def test_names_read_as_text(page):
