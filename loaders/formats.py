@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.colmap.formats import BINARY, TEXT
@@ -23,6 +23,17 @@ from sfm_audit.loaders.paths.locations import InputPath
 
 FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL, BLOCKS_EXCHANGE)
 """Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
+
+WITHOUT_POINTS: Final[Mapping[str, str]] = {
+    "transforms.json": "transforms.json (nerfstudio, instant-ngp) holds cameras and no points",
+    "cameras.xml": "cameras.xml, Metashape's own export of cameras, holds no tie points",
+}
+"""Files that people take for models and that hold no observations: what is said of a folder that has no other."""
+_ASKED_FOR: Final = {
+    "transforms.json": "audit the COLMAP model that it was made from",
+    "cameras.xml": "export BlocksExchange XML with tie points from Metashape",
+}
+_BESIDE: Final = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse", "colmap")
 
 _Value = TypeVar("_Value")
 
@@ -55,6 +66,22 @@ def model_file_names(folder: InputPath) -> tuple[str, ...]:
 def marks_model(names: Collection[str]) -> bool:
     """Whether a folder with these names counts as a model folder: it has a file that some format requires."""
     return any(matching(name, names) for each in FORMATS for name in each.required)
+
+
+def without_points(folder: InputPath) -> tuple[str, str] | None:
+    """Return what is said of a folder that has no model but a file of `WITHOUT_POINTS`, and what to do; else None.
+
+    Where the COLMAP model that nerfstudio's or instant-ngp's file was made from lies below the folder, it is named.
+    """
+    found = next((name for name in WITHOUT_POINTS if name in names_in(folder)), None)
+    if found is None:
+        return None
+    advice = _ASKED_FOR[found]
+    if found == "transforms.json":
+        places = (folder.joinpath(*place.split("/")) for place in _BESIDE) if isinstance(folder, Path) else ()
+        model = next((place for place in places if marks_model(names_in(place))), None)
+        advice += f", {model}" if model is not None else ""
+    return WITHOUT_POINTS[found], advice
 
 
 def files_read(listing: Mapping[str, _Value]) -> dict[str, _Value]:
@@ -153,6 +180,9 @@ def _incomplete(folder: InputPath, there: tuple[str, ...]) -> MissingFileError:
     wanted = (
         f"{', '.join(meant.required[:-1])} and {meant.required[-1]}" if len(meant.required) > 1 else meant.required[0]
     )
+    known = None if there else without_points(folder)
+    if known is not None:
+        return MissingFileError(str(folder), None, "a model with points", *known)
     got = f"only {', '.join(there)}" if there else "none of them"
     other_case = {name.lower(): name for name in names_in(folder) if name not in there}
     renamed = [f"rename {other_case[name.lower()]} to {name}" for name in missing if name.lower() in other_case]

@@ -24,7 +24,7 @@ from sfm_audit.loaders.datasets.layouts import (
 )
 from sfm_audit.loaders.datasets.walk import LIMITS, Folder, leads_out, walk
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
-from sfm_audit.loaders.formats import format_names, marks_model, model_files_among
+from sfm_audit.loaders.formats import format_names, marks_model, model_files_among, without_points
 from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
 
@@ -156,7 +156,7 @@ def _models_below(given: str | Path, layout: Layout | None, *, follow_links: boo
             other = place_of(named_parts + each.parts) or Place("", ONLY_COMPONENT, 0)
             left_out.append(_ref(dataset, other, model_path, each))
     if not refs and not errors:
-        errors.append(_nothing_found(str(given), left_out, layout))
+        errors.append(_nothing_found(str(given), root, left_out, layout))
     return Discovery(tuple(refs), tuple(errors), tuple(left_out), _notes(str(given), searched.links_out))
 
 
@@ -183,7 +183,10 @@ def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef
     )
 
 
-def _nothing_found(given: str, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:
+def _nothing_found(given: str, root: InputPath, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:
+    known = None if left_out else without_points(root)
+    if known is not None:
+        return MissingFileError(given, None, "a model with points at or below it", *known)
     if layout is None or not left_out:
         wanted, got = "a model folder at or below it", f"no file of a model ({', '.join(format_names())})"
         return MissingFileError(given, None, wanted, got, "name a folder that holds models")

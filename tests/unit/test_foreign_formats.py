@@ -371,3 +371,26 @@ def test_bytes_of_an_xml_file_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(xml_file, "MAX_BYTES", 1000)
     with pytest.raises(LoadError, match="at most 1000 bytes of XML"):
         open_model(fs.write(tmp_path, fs.blocks_exchange_files(fs.scene())))
+
+
+def test_transforms_json_has_no_points_and_names_the_model_beside_it(tmp_path):
+    folder = fs.write(tmp_path / "scene", {"transforms.json": b"{}"})
+    said = (
+        "expected a model with points.*, found transforms.json .* holds cameras and no points; audit the COLMAP model"
+    )
+    with pytest.raises(LoadError, match=said):
+        open_model(folder)
+    (error,) = discover([folder]).errors
+    assert re.search(said, str(error))
+    model = fs.write_colmap(folder / "colmap" / "sparse" / "0", fs.scene(), "RADIAL", camera_per_image=False)
+    with pytest.raises(LoadError, match=re.escape(f"audit the COLMAP model that it was made from, {model}")):
+        open_model(folder)
+    assert [ref.model_path for ref in discover([folder]).refs] == [str(model)]
+
+
+def test_metashape_s_cameras_have_no_tie_points(tmp_path):
+    folder = fs.write(tmp_path, {"cameras.xml": b"<document/>"})
+    with pytest.raises(
+        LoadError, match=r"found cameras.xml, Metashape's own export of cameras, holds no tie points; export"
+    ):
+        open_model(folder)
