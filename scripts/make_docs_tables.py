@@ -10,6 +10,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.words import REASONS, Member, ReasonWords
 from sfm_audit.loaders.model import FINDING_MEANINGS, FindingCode
+from sfm_audit.reports.text.codes import codes_page
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TABLES_INTRODUCTION = """# Tables
@@ -59,7 +60,7 @@ Made from `loaders/model.py` by `scripts/make_docs_tables.py`; do not edit.
 A model that can be read is audited, however inconsistent it is; what is inconsistent stands in the column `findings` of
 `RUN/models`: a code, how many items it concerns, and one line for people. A model that cannot be read (a file is
 missing, cut short, or not what it says) has no findings: it is a failure in `run.json`, one line on stderr, and exit
-code 3.
+code 3. A code leads to its causes and what to do; `sfm-audit explain-code CODE` says the same.
 
 """
 VERDICTS_PAGE = """# Verdicts
@@ -116,7 +117,8 @@ noise rejects, or a misfit is worth less than 0.02 degrees and 0.1 %; **medium**
 ## Reasons
 
 `reasons` lists, for the verdicts of the policy, a code, a colon, and the number that triggered it. *Remarks* stand in
-the same list and decide nothing: an accepted image may carry them.
+the same list and decide nothing: an accepted image may carry them. A code leads to its causes and what to do;
+`sfm-audit explain-code CODE` says the same.
 
 {reasons}
 
@@ -161,14 +163,14 @@ def config_page() -> str:
 
 def findings_page() -> str:
     """Return docs/findings.md."""
-    rows = [f"| `{code}` | {_cell(FINDING_MEANINGS[code])} |" for code in FindingCode]
+    rows = [f"| [`{code}`](codes.md#{code}-finding) | {_cell(FINDING_MEANINGS[code])} |" for code in FindingCode]
     return FINDINGS_PAGE + "\n".join(["| code | meaning |", "|---|---|", *rows, ""])
 
 
 def verdicts_page() -> str:
     """Return docs/verdicts.md."""
     rows = [
-        f"| `{code}` | {_members(words)} | {_makes(words)} | {_cell(words.meaning)} |"
+        f"| [`{code}`](codes.md#{code}) | {_members(words)} | {_makes(words)} | {_cell(words.meaning)} |"
         for code, words in REASONS.items()
     ]
     reasons = "\n".join(
@@ -190,6 +192,7 @@ PAGES = {
     "tables.md": table_page,
     "config.md": config_page,
     "findings.md": findings_page,
+    "codes.md": codes_page,
     "verdicts.md": verdicts_page,
 }
 

@@ -6,13 +6,22 @@ import datetime as dt
 import importlib.metadata
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
+from sfm_audit.audit.cli.again import Again, with_again
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.gate_file import read_gate_file
 from sfm_audit.audit.cli.poses import aligned
-from sfm_audit.audit.cli.runs import ComparedRun, read_run, refuse_different_settings, without_poses, write_file
+from sfm_audit.audit.cli.runs import (
+    ComparedRun,
+    read_run,
+    read_run_like,
+    refuse_different_settings,
+    without_poses,
+    write_file,
+)
 from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.gate import judge
@@ -33,6 +42,7 @@ _FILE = click.Path(path_type=Path)
 @click.option("--junit", metavar="FILE", type=_FILE, help="Write JUnit XML, for Jenkins and GitLab.")
 @click.option("--markdown", metavar="FILE", type=_FILE, help="Write Markdown, for a GitHub step summary.")
 @click.option("--json", "json_file", metavar="FILE", type=_FILE, help="Write everything as JSON (docs/nightly.md).")
+@with_again
 def command(
     *,
     run: Path,
@@ -41,18 +51,20 @@ def command(
     junit: Path | None,
     markdown: Path | None,
     json_file: Path | None,
+    **again: Any,
 ) -> ExitCode:
     """Judge the run folder RUN by the limits of a gate file, and against a baseline by its bands.
 
     An empty gate file checks only what --baseline implies: nothing lost, no other camera model, noise and errors not
-    larger, images not newly rejected, no new systematic error; docs/nightly.md has the default bands.
+    larger, images not newly rejected, no new systematic error; docs/nightly.md has the default bands. A baseline of
+    another policy is decided again under the settings of RUN.
 
     Exit codes: 0 passed; 1 a check failed; 2 wrong usage or gate file, or runs of different settings; 3 RUN or RUN0 is
     no finished run, or RUN has inputs that could not be read; 4 a report file could not be written.
     """
     policy = read_gate_file(policy_file, has_baseline=baseline is not None)
-    run_read = read_run(run)
-    baseline_read = read_run(baseline) if baseline else None
+    run_read = read_run(run, Again.of(**again))
+    baseline_read = read_run_like(baseline, run_read) if baseline else None
     if baseline_read:
         refuse_different_settings([baseline_read, run_read])
     report = _judged(policy, run_read, baseline_read)
@@ -68,7 +80,7 @@ def command(
 def _judged(policy: GatePolicy, run: ComparedRun, baseline: ComparedRun | None) -> GateReport:
     comparison = compare(baseline.snapshot, run.snapshot, aligned) if baseline else None
     checks = judge(policy, run.snapshot, comparison)
-    notes = []
+    notes = [f"{each.folder}: {each.decided_again}" for each in (run, baseline) if each and each.decided_again]
     if comparison is not None and comparison.nothing_in_common:
         notes.append(OTHER_NAMES)
     if baseline and baseline.unread:

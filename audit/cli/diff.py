@@ -9,7 +9,7 @@ import click
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.poses import aligned
-from sfm_audit.audit.cli.runs import ComparedRun, different_settings, read_run, without_poses
+from sfm_audit.audit.cli.runs import ComparedRun, different_settings, read_run, read_run_like, without_poses
 from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.reports.compare.comparison import Comparison, compare
 from sfm_audit.reports.compare.page import render_comparison
@@ -27,14 +27,18 @@ def command(*, before: Path, after: Path, exit_code: bool, page: Path | None, fo
     """Show what is different in RUN1: images newly rejected, fixed, lost, added; noise and errors per scene.
 
     The models are aligned, and images whose cameras are elsewhere then are listed, those that moved together first.
-    Images are compared by dataset, scene and name, so that components and ids may be renumbered.
+    Images are compared by dataset, scene and name, so that components and ids may be renumbered. Where the policy
+    or another setting that only decides differs, RUN0 is decided again under the settings of RUN1.
 
-    Exit codes: 0 fine; 1 with --exit-code if anything changed; 2 the page exists; 3 RUN0 or RUN1 is no finished run;
-    4 the page could not be written.
+    Exit codes: 0 fine; 1 with --exit-code if anything changed; 2 the page exists, or RUN0 cannot be decided as RUN1
+    was; 3 RUN0 or RUN1 is no finished run; 4 the page could not be written.
     """
     if page is not None:
         _refuse_taken(page, force=force)
-    runs = [read_run(before), read_run(after)]
+    last = read_run(after)
+    runs = [read_run_like(before, last), last]
+    if runs[0].decided_again:
+        complain(f"{before}: {runs[0].decided_again}, as {after}")
     problem = different_settings(runs)
     if problem:
         complain(f"{problem}: verdicts differ for that reason too")

@@ -6,11 +6,12 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 import numpy as np
 
+from sfm_audit.audit.cli.again import Again, with_again
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.runs import open_run
 from sfm_audit.loaders import LoadError, open_model
@@ -58,6 +59,7 @@ class _Request:
 @click.option("--model-out", metavar="DIR", type=_PATH, help="... and where to write it without the other images.")
 @click.option("--scene-info", metavar="F", type=_PATH, help="A scene_info file of LoFTR, D2-Net or glue-factory ...")
 @click.option("--scene-info-out", metavar="F", type=_PATH, help="... and where to write it without their pairs.")
+@with_again
 @click.option("--force", is_flag=True, help="Replace outputs that exist.")
 def command(
     *,
@@ -69,6 +71,7 @@ def command(
     scene_info: Path | None,
     scene_info_out: Path | None,
     force: bool,
+    **again: Any,
 ) -> ExitCode:
     """Write what the verdicts in the run folder RUN leave of a dataset.
 
@@ -87,7 +90,7 @@ def command(
             "Nothing to write: give --list, --model and --model-out, or --scene-info and --scene-info-out."
         )
     _check_outputs(outputs, [path for path in (run_folder, model, scene_info) if path is not None], model_out, force)
-    request = _open(run_folder, Keep(keep))
+    request = _open(run_folder, Keep(keep), Again.of(**again))
     steps: list[Callable[[], str]] = []
     if list_out is not None:
         steps.append(lambda: _write_list(request, list_out))
@@ -115,9 +118,9 @@ def _check_outputs(outputs: Sequence[Path], inputs: Sequence[Path], model_out: P
             raise KnownError(str(error), ExitCode.OUTPUT) from error
 
 
-def _open(run_folder: Path, keep: Keep) -> _Request:
+def _open(run_folder: Path, keep: Keep, again: Again) -> _Request:
     try:
-        run = open_run(run_folder)
+        run = again.read(open_run(run_folder))
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     try:

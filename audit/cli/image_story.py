@@ -3,47 +3,93 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map, median_depth
-from sfm_audit.audit.cli.recompute import tau_px
+from sfm_audit.audit.cli.recompute import ResidualSource, tau_px
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.notebook.residuals import image_residuals_of
 from sfm_audit.audit.notebook.story import explained_field, xyz_cam_of
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.reports import figures
-from sfm_audit.reports.charts import CAPTIONS, Residuals
+from sfm_audit.reports.charts import CAPTIONS, ResidualError, Residuals
+from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.text.explain import Story, render_story, strongest_where
+from sfm_audit.reports.text.wording import plain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldImage:
-    """The story as text, and its pictures: file name -> content."""
+    """The story as text, and its pictures: file name -> content, and what each shows.
 
+    row: of ``RUN/images``.    residuals: None where neither run nor model has them.
+    """
+
+    row: Mapping[str, Any]
     text: str
-    pictures: Mapping[str, bytes]
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    captions: Mapping[str, str] = field(default_factory=dict)
+    residuals: Residuals | None = None
 
 
 def tell(auditor: ModelAuditor, image_idx: int) -> ToldImage:
     """Audit a model, and tell the story of the image in row ``image_idx``."""
     with threadpool_limits(limits=1, user_api="blas"):
         row = _row(auditor, image_idx)
+    return _told_with_model(auditor, image_idx, row, auditor.config.model_dump())
+
+
+def tell_from_run(run: RunReader, row: Mapping[str, Any]) -> ToldImage:
+    """Tell the story of the image in a row of ``RUN/images`` that knows its ``part``; nothing is audited again.
+
+    Pictures are drawn from the model where it lies as the run read it, else from RUN/observations, else not at all.
+    """
+    config, source = run.info["config"], ResidualSource(run)
+    try:
+        auditor = source.auditor(row["model_path"])
+    except ResidualError as error:
+        problem = str(error)
+    else:
+        found = np.flatnonzero(auditor.model.images.image_id == row["image_id"])
+        if len(found):
+            return _told_with_model(auditor, int(found[0]), row, config, run.info.get("decided_again"))
+        problem = f"{row['model_path']}: holds no image of id {row['image_id']} any more"
+    if not run.has_part("observations", row["part"]):
+        story = Story(row, config, row["model_path"], None, {}, run.info.get("decided_again"))
+        return ToldImage(row, f"{render_story(story)}\nNo pictures: {plain(problem)}\n")
+    residuals = source.residuals(row)
+    drawn = _figures(row, config, residuals, None, None)
+    return _told(Story(row, config, row["model_path"], None, {}, run.info.get("decided_again")), drawn, residuals)
+
+
+def _told_with_model(
+    auditor: ModelAuditor,
+    image_idx: int,
+    row: Mapping[str, Any],
+    config: Mapping[str, Any],
+    decided_again: str | None = None,
+) -> ToldImage:
+    with threadpool_limits(limits=1, user_api="blas"):
         residuals = image_residuals_of(auditor, image_idx, row)
         field_px = explained_field(auditor, image_idx, row)
         error_px = _expected_error(auditor, image_idx, row)
-    config = auditor.config.model_dump()
     drawn = _figures(row, config, residuals, field_px, error_px)
     where = None if field_px is None else strongest_where(residuals.xy_px, field_px, residuals.size_px)
+    return _told(Story(row, config, auditor.model.location, where, {}, decided_again), drawn, residuals)
+
+
+def _told(story: Story, drawn: Mapping[str, Figure], residuals: Residuals) -> ToldImage:
     names = {name: f"{number:02d}_{name}.png" for number, name in enumerate(drawn, 1)}
     captions = {names[name]: CAPTIONS[name] for name in drawn}
-    text = render_story(Story(row, config, auditor.model.location, where, captions))
-    return ToldImage(text, {names[name]: _png(figure) for name, figure in drawn.items()})
+    pictures = {names[name]: _png(figure) for name, figure in drawn.items()}
+    return ToldImage(story.row, render_story(replace(story, pictures=captions)), pictures, captions, residuals)
 
 
 def _row(auditor: ModelAuditor, image_idx: int) -> dict[str, Any]:

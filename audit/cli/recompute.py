@@ -49,7 +49,7 @@ class ResidualSource:
         """
         if self._run.has_part("observations", row["part"]):
             return residuals_of_row(self._run, row["part"], row)
-        auditor = self._auditor(row["model_path"])
+        auditor = self.auditor(row["model_path"])
         found = np.flatnonzero(auditor.model.images.image_id == row["image_id"])
         if not len(found):
             raise ResidualError(f"{row['model_path']}: holds no image of id {row['image_id']} any more")
@@ -64,7 +64,7 @@ class ResidualSource:
         if self._run.has_part("observations", row["part"]):
             names = ("x_px", "y_px", "residual_x_px", "residual_y_px")
             return Residuals.from_table(self._run.rows_of_camera(row["part"], row["camera_id"], names), size_px=size_px)
-        auditor = self._auditor(row["model_path"])
+        auditor = self.auditor(row["model_path"])
         model, residuals = auditor.model, auditor.residuals
         mine = np.repeat(model.images.camera_id == row["camera_id"], np.diff(residuals.offsets))
         xy_px = model.observations.xy_px[residuals.observation_row[mine]]
@@ -78,9 +78,13 @@ class ResidualSource:
         ResidualError
             It cannot be read, or is another one now; one line says why.
         """
-        return self._auditor(model_path).model
+        return self.auditor(model_path).model
 
-    def _auditor(self, model_path: str) -> ModelAuditor:
+    def auditor(self, model_path: str) -> ModelAuditor:
+        """Return the auditor of a model of the run, with the run's settings; the last one is kept.
+
+        Errors as of `model`.
+        """
         if self._last is None or self._last[0] != model_path:
             self._last = None  # two models at a time would be one too many
             try:

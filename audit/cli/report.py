@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
+from sfm_audit.audit.cli.again import Again, with_again
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.runs import open_run
@@ -30,10 +32,19 @@ from sfm_audit.reports.text.wording import counted, plain
     multiple=True,
     help="Models of RUN in this object store may be read; RUN alone opens none. Repeatable.",
 )
+@with_again
 @click.option("--force", is_flag=True, help="Replace the page if it is there.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def command(
-    *, run: Path, out: Path, photos: Path | None, worst: int, models: tuple[str, ...], force: bool, quiet: bool
+    *,
+    run: Path,
+    out: Path,
+    photos: Path | None,
+    worst: int,
+    models: tuple[str, ...],
+    force: bool,
+    quiet: bool,
+    **again: Any,
 ) -> ExitCode:
     """Write one HTML page about the run folder RUN: it needs no network and no other file.
 
@@ -48,7 +59,7 @@ def command(
         check_free(out, force=force)
         if photos is not None and not photos.is_dir():
             raise KnownError(f"{photos}: is no folder; name the folder of the photos", ExitCode.USAGE)
-        reader = open_run(run, quiet=quiet)
+        reader = Again.of(**again).read(open_run(run, quiet=quiet))
         with extra("report"):
             from sfm_audit.audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
         page = make_page(reader, photos, worst, models, silent=quiet or not sys.stderr.isatty())

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from sfm_audit.audit.cli.again import Again, under, valid_settings
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
 from sfm_audit.reports.errors import RunFolderError
@@ -17,11 +18,18 @@ from sfm_audit.reports.run_folder.reader import RunReader
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedRun:
-    """A run folder and what its tables say."""
+    """A run folder and what its tables say. again: the settings it was decided again under."""
 
     folder: Path
     info: dict[str, Any]
     snapshot: RunSnapshot
+    again: Again = field(default_factory=Again)
+
+    @property
+    def decided_again(self) -> str | None:
+        """The settings it was decided again under, in words; None for its own."""
+        words = self.info.get("decided_again")
+        return f"decided again: {words}" if words else None
 
     @property
     def unread(self) -> list[tuple[str, str]]:
@@ -29,14 +37,38 @@ class ComparedRun:
         return [(str(item["location"]), str(item["message"])) for item in self.info.get("failures", [])]
 
 
-def read_run(folder: Path) -> ComparedRun:
-    """Read a run folder.
+def read_run(folder: Path, again: Again | None = None) -> ComparedRun:
+    """Read a run folder, under other settings where ``again`` asks for them.
 
     Raises
     ------
     KnownError
-        It holds no run, one that was not finished, or tables that cannot be read.
+        It holds no run, one that was not finished, tables that cannot be read or cannot be decided so.
     """
+    wanted = again or Again()
+    return _compared(wanted.read(_finished(folder)), wanted)
+
+
+def read_run_like(folder: Path, run: ComparedRun) -> ComparedRun:
+    """Read a run folder, decided under the settings of another run as far as these decide; errors as of `read_run`.
+
+    Where a setting differs that changes what is measured, it is read as it is (`different_settings` says so).
+    """
+    from sfm_audit.audit.decision.from_table import FIXED_SETTINGS  # noqa: PLC0415 - SciPy
+
+    found = _finished(folder)
+    shared = found.info["config"].keys() & run.info["config"].keys()
+    differ = {name for name in shared if found.info["config"][name] != run.info["config"][name]}
+    if differ & set(FIXED_SETTINGS):
+        return _compared(found, Again())
+    if differ:
+        found = under(found, valid_settings(run.folder, run.info["config"]), run.again.rejections)
+    else:
+        found = Again(rejections=run.again.rejections).read(found)
+    return _compared(found, run.again)
+
+
+def _finished(folder: Path) -> RunReader:
     try:
         run = open_run(folder)
     except RunFolderError as error:
@@ -44,12 +76,16 @@ def read_run(folder: Path) -> ComparedRun:
     if run.info.get("status") != "complete":
         problem = f"{folder}: the run was not finished; give its run command again, it goes on where it stopped"
         raise KnownError(problem, ExitCode.UNREADABLE_INPUT)
+    return run
+
+
+def _compared(run: RunReader, again: Again) -> ComparedRun:
     try:
-        return ComparedRun(folder, run.info, RunSnapshot.read(run))
+        return ComparedRun(run.folder, run.info, RunSnapshot.read(run), again)
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     except (pa.ArrowException, OSError, MissingColumnError, ValueError) as error:
-        problem = f"{folder}: its tables cannot be read ({error}); make the run again"
+        problem = f"{run.folder}: its tables cannot be read ({error}); make the run again"
         raise KnownError(problem, ExitCode.UNREADABLE_INPUT) from error
 
 

@@ -106,6 +106,36 @@ def redecide(images: pa.Table, settings: AuditConfig, *, run: AuditConfig) -> pa
     return _replaced(images, written)
 
 
+def redecide_cameras(cameras: pa.Table, images: pa.Table, settings: AuditConfig, *, run: AuditConfig) -> pa.Table:
+    """Return the cameras of one model under other settings: ``misfit_material`` and the advice that rests on it.
+
+    Parameters
+    ----------
+    cameras, images : the tables of one model as the run wrote them            settings, run : as of `redecide`
+
+    Notes
+    -----
+    The cause that is named stays that of the run. A camera is material still if its effect is above the median tau of
+    its images; the advice for one that is no longer goes.
+    """
+    if settings.min_effect == run.min_effect or not cameras.num_rows:
+        return cameras
+    sigma_px: dict[int, list[float]] = {}
+    for row in images.select(["camera_id", "sigma_constant_px"]).to_pylist():
+        sigma_px.setdefault(row["camera_id"], []).append(number_of(row["sigma_constant_px"]))
+    material, advice = [], []
+    for row in cameras.select(["camera_id", "misfit_px", "misfit_material", _ADVICE]).to_pylist():
+        tau_px = settings.tau_px(float(np.nanmedian(sigma_px.get(row["camera_id"], [math.nan]))))
+        still = bool(row["misfit_material"]) and number_of(row["misfit_px"]) > tau_px
+        material.append(still)
+        advice.append(row[_ADVICE] if still == bool(row["misfit_material"]) else None)
+    for name, values in (("misfit_material", material), (_ADVICE, advice)):
+        at = cameras.column_names.index(name)
+        kind = cameras.schema.field(at)
+        cameras = cameras.set_column(at, kind, pa.array(values, type=kind.type))
+    return cameras
+
+
 _WRITTEN: Final = (*CAUSE_COLUMNS, *WORTH_COLUMNS, _ADVICE, *VERDICT_COLUMNS)
 _READ: Final = frozenset({*READ_COLUMNS, *_MODEL, _ADVICE, "camera_id"})
 

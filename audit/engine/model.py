@@ -15,6 +15,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
 from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
+from sfm_audit.audit.decision.triage import triage
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
 from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, pose_findings, residual_findings
 from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, camera_diagnostics
@@ -342,11 +343,13 @@ class ModelAuditor:
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
+        cameras = [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]
         asked = self.outside.witnesses
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions, asked)
+        row["diagnoses"] = triage(rows, cameras, labels.model_path)
         return ModelAudit(
             images_table(rows),
-            table_of("cameras", [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]),
+            table_of("cameras", cameras),
             table_of("models", [row]),
             self.observations(labels) if observations else None,
         )

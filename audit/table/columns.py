@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from sfm_audit.audit.table.arrow import build_table
 from sfm_audit.audit.table.calibration import CALIBRATION, CALIBRATION_RESIDUALS
+from sfm_audit.audit.table.diagnoses import DIAGNOSIS
 from sfm_audit.audit.table.kinds import (
     CODED_TEXT,
     MISFIT_DETAIL,
@@ -289,6 +290,12 @@ MODELS: Final[tuple[Column, ...]] = (
     ),
     texts("witnesses", "witnesses outside of the images that were asked (docs/witnesses.md); null where none was"),
     Column("findings", list_of(_FINDING), "text", "inconsistencies of the model: code, how many items, one line each"),
+    Column(
+        "diagnoses",
+        list_of(DIAGNOSIS),
+        "text",
+        "what is the matter and what to do first, most urgent first (RUN stands for the run folder)",
+    ),
 )
 
 OBSERVATIONS: Final[tuple[Column, ...]] = (

@@ -58,6 +58,7 @@ def render_page(page: PageInput) -> str:
             config=content.config,
             totals={verdict: content.verdicts.count(verdict) for verdict in Verdict},
             num_images=content.num_images,
+            decided_again=info.get("decided_again"),
             summary=_summary(content),
             questions=_questions(content),
             verdict_figure=_verdict_figure(content),

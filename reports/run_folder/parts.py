@@ -87,19 +87,35 @@ def rows_of(part: pq.ParquetFile, table: str, columns: Sequence[str]) -> Iterato
     ValueError
         A column is not of its type, or lacks what is never null.
     """
+    _check_types(part.schema_arrow, table, columns)
+    for batch in part.iter_batches(_ROWS_AT_A_TIME, columns=list(columns)):
+        _check_nulls(batch, table)
+        yield from batch.to_pylist()
+
+
+def table_of(part: pq.ParquetFile, table: str) -> pa.Table:
+    """Return all rows and columns of a part; errors as of `rows_of`."""
+    _check_types(part.schema_arrow, table, part.schema_arrow.names)
+    read = part.read()
+    for batch in read.to_batches():
+        _check_nulls(batch, table)
+    return read
+
+
+def _check_types(found: pa.Schema, table: str, columns: Sequence[str]) -> None:
     types = _TYPES[table]  # type: ignore[index]
-    found = part.schema_arrow
     lost = sorted(_NEVER_NULL.get(table, frozenset()).intersection(columns) - set(found.names))
     if lost:
         raise ValueError(f"it has no column {lost[0]}")
     for name in columns:
         if name in types and name in found.names and found.field(name).type != types[name]:
             raise ValueError(f"its column {name} is of type {found.field(name).type}, not {types[name]}")
-    for batch in part.iter_batches(_ROWS_AT_A_TIME, columns=list(columns)):
-        for name, values in zip(batch.schema.names, batch.columns, strict=True):
-            if (name in _NEVER_NULL.get(table, ()) and values.null_count) or _has_null_elements(values):
-                raise ValueError(f"its column {name} has a null where there never is one")
-        yield from batch.to_pylist()
+
+
+def _check_nulls(batch: pa.RecordBatch, table: str) -> None:
+    for name, values in zip(batch.schema.names, batch.columns, strict=True):
+        if (name in _NEVER_NULL.get(table, ()) and values.null_count) or _has_null_elements(values):
+            raise ValueError(f"its column {name} has a null where there never is one")
 
 
 @contextmanager

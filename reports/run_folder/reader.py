@@ -5,11 +5,11 @@ Nothing is read but what the manifest names, and of that only what fits it (docs
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Protocol
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -17,11 +17,22 @@ import pyarrow.parquet as pq
 
 from sfm_audit.reports.errors import DamagedRunError, RunFolderError
 from sfm_audit.reports.run_folder.manifest import MANIFEST, Manifest
-from sfm_audit.reports.run_folder.parts import checked_part, part_path, rows_of
+from sfm_audit.reports.run_folder.parts import checked_part, part_path, rows_of, table_of
 from sfm_audit.reports.run_folder.record import ModelRecord, RunRecord, old_models, read_run_json
 
 Row = dict[str, Any]
 OLD_NOTE = "was written by an older sfm-audit without hashes; only labels and rows of its parts were checked"
+
+
+REVISED: Final = ("images", "cameras", "models")
+"""Tables that a revision may change."""
+
+
+class Revision(Protocol):
+    """What becomes of a run's verdicts under other settings: from the tables of one model to those that are read."""
+
+    def __call__(self, table: str, key: str, read: Callable[[str], pa.Table]) -> pa.Table:
+        """Return a table of the model ``key`` as it is to be read; ``read``: its tables as the run wrote them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +40,14 @@ class RunReader:
     """A run folder that is read, not written. info: the content of run.json, checked.    contents: its models.
 
     note: what a reader should know about how far it could be checked; None for nothing.
+    revision: None for the tables as they were written.
     """
 
     folder: Path
     info: dict[str, Any]
     contents: Manifest | tuple[ModelRecord, ...]
     note: str | None = None
+    revision: Revision | None = None
 
     @classmethod
     def open(cls, folder: Path) -> RunReader:
@@ -56,6 +69,10 @@ class RunReader:
             raise DamagedRunError(folder, "its run.json does not say which models it holds")
         return cls(folder, info, Manifest.read(folder, record.manifest if record.status == "complete" else None))
 
+    def revised(self, config: dict[str, Any], revision: Revision, decided_again: str) -> RunReader:
+        """Return the run as it is read under other settings; ``decided_again``: which, in words."""
+        return replace(self, info={**self.info, "config": config, "decided_again": decided_again}, revision=revision)
+
     @property
     def num_models(self) -> int:
         """How many models the run holds."""
@@ -74,6 +91,9 @@ class RunReader:
             A part is not what the run wrote.
         """
         for model in self.models():
+            if self.revision is not None and table in REVISED:
+                yield from self._revised_rows(table, model, columns)
+                continue
             with self._part(table, model) as part:
                 yield from rows_of(part, table, columns)
 
@@ -84,8 +104,11 @@ class RunReader:
         """
         blank = dict.fromkeys(columns)
         for model in self.models():
-            with self._part(table, model) as part:
-                rows = [blank | row for row in rows_of(part, table, columns)]
+            if self.revision is not None and table in REVISED:
+                rows = [blank | row for row in self._revised_rows(table, model, columns)]
+            else:
+                with self._part(table, model) as part:
+                    rows = [blank | row for row in rows_of(part, table, columns)]
             yield part_path(self.folder, table, model.key).name, rows
 
     def has_part(self, table: str, name: str) -> bool:
@@ -127,6 +150,18 @@ class RunReader:
         mine = images.filter(pc.field("camera_id") == camera_id)["image_id"]
         with self._part("observations", model) as part:
             return part.read(columns=[*columns, "image_id"]).filter(pc.field("image_id").isin(mine.combine_chunks()))
+
+    def _revised_rows(self, table: str, model: ModelRecord, columns: Sequence[str]) -> list[Row]:
+        """Return the rows of a table of one model, revised."""
+        if self.revision is None:
+            raise ValueError("nothing is revised")
+
+        def read(name: str) -> pa.Table:
+            with self._part(name, model) as part:
+                return table_of(part, name)
+
+        revised = self.revision(table, model.key, read)
+        return revised.select([name for name in columns if name in revised.column_names]).to_pylist()
 
     def _find(self, key: str) -> ModelRecord | None:
         if isinstance(self.contents, Manifest):

@@ -76,6 +76,10 @@ _WORDS: Final = {
     "camera_not_tested": "its camera could not be asked in the joint system ({detail})",
     "misfit_without_worth": "a misfit that would change pose and focal length by next to nothing: {detail}",
     "noise_differs": "the noise is visibly another one than the noise model says ({detail}){tails}",
+    "pairs_disagree": "its verified matches with neighbours contradict the cameras: {detail}",
+    "fold_disagrees": "images that should see the same points see two different sets of them: {detail}",
+    "reference_disagrees": "the pose is not where the reference has it: {detail}",
+    "priors_disagree": "the centre is not where its prior has it: {detail}",
     "pixel_convention": "half a pixel between 2D points and cameras explains it: {detail}",
 }
 REASON_CODES: Final = frozenset(_WORDS)
@@ -135,6 +139,7 @@ class Story:
     """What is told about one image.
 
     row: of ``RUN/images``.    where: of `strongest_where`.    pictures: file name -> caption.
+    decided_again: the settings after the run, in words; None for its own.
     """
 
     row: Mapping[str, Any]
@@ -142,6 +147,7 @@ class Story:
     location: str
     where: str | None
     pictures: Mapping[str, str]
+    decided_again: str | None = None
 
 
 def render_story(story: Story, width: int = 100) -> str:
@@ -220,6 +226,8 @@ def _heading(story: Story, width: int) -> str:
     name, place = plain(row["image_name"]), plain(story.location)
     policy = story.config.get("policy")
     lines = [f"{name} (id {row['image_id']}): {str(row['verdict']).upper()} under the policy {policy}", f"in {place}"]
+    if story.decided_again:
+        lines.append(f"decided again after the run: {story.decided_again}")
     return "\n".join(paragraph(line, width, "  ") for line in lines)
 
 

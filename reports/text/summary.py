@@ -15,6 +15,7 @@ from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, SEVERITY
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
 from sfm_audit.reports.text.reasons import reasons_part
+from sfm_audit.reports.text.triage import MAX_DIAGNOSES, triage_part, urgency
 from sfm_audit.reports.text.witnesses import witnesses_line
 from sfm_audit.reports.text.wording import (
     MISSING,
@@ -36,7 +37,7 @@ VERDICT_STYLE: Final[dict[str, str]] = {
 MODEL_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "num_images", "num_accepted", "num_rejected", "num_undetermined"),
     *("stored_error_px", "recomputed_observation_error_px", "noise_s0_px", "share_stale_point_errors", "findings"),
-    *("num_nonstationary_images", "witnesses"),
+    *("num_nonstationary_images", "witnesses", "diagnoses"),
     *(f"num_{verdict}_{member.short}" for member in Member for verdict in Verdict),
 )
 IMAGE_COLUMNS: Final = (
@@ -48,6 +49,7 @@ CAMERA_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "camera_id", "camera_model", "num_images"),
     *("misfit_group", "misfit_px", "misfit_material", "advised_camera_model"),
 )
+LABELS: Final = ("dataset", "scene", "component", "model_path")
 MAX_MODELS: Final = 40
 MAX_IMAGES_OF_ONE: Final = 25
 MAX_IMAGES_OF_MANY: Final = 12
@@ -113,6 +115,9 @@ class _Models:
         default_factory=lambda: _Smallest(MAX_MODELS, lambda row: (-_share_rejected(row), _model_order(row)))
     )
 
+    diagnoses: _Smallest = field(default_factory=lambda: _Smallest(MAX_DIAGNOSES, urgency))
+    num_diagnoses: int = 0
+
     @classmethod
     def read(cls, rows: Iterable[Row]) -> _Models:
         """Go through the rows once; they may come in any order."""
@@ -126,6 +131,9 @@ class _Models:
             models.first.add(row)
             models.worst.add(row)
             models._add_findings(row)
+            for diagnosis in row.get("diagnoses") or []:
+                models.diagnoses.add({**diagnosis, **{name: row[name] for name in LABELS}})
+                models.num_diagnoses += 1
         return models
 
     def _add_findings(self, row: Row) -> None:
@@ -155,15 +163,25 @@ def render_summary(run: RunReader, page: Page) -> str:
         *_images_part(run, models, page),
         *_cameras_part(run, models, page),
     ]
-    parts += [*_findings_part(models, page), *_failures_part(run, page), *_closing(run, models, page)]
+    parts += [*_findings_part(models, page), *_failures_part(run, page)]
+    parts += [
+        *triage_part(models.diagnoses.rows(), models.num_diagnoses, run.folder, page, _where(models)),
+        *_closing(run, models, page),
+    ]
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
+
+
+def _where(models: _Models) -> Callable[[Row], str] | None:
+    """Return how a model is called; None where there is one only."""
+    return None if models.num_models == 1 else lambda row: _model_name(row, several=models.several)
 
 
 def _heading(run: RunReader) -> str:
     config = run.info["config"]
     settings = {"noise": "noise", "points": "points", "policy": "policy", "alpha": "alpha", "min_effect": "min effect"}
     said = ", ".join(f"{words} {config.get(name)}" for name, words in settings.items())
-    return f"sfm-audit {run.info['version']}: {said}"
+    again = f"; decided again: {run.info['decided_again']}" if run.info.get("decided_again") else ""
+    return f"sfm-audit {run.info['version']}: {said}{again}"
 
 
 def _models_part(models: _Models, page: Page) -> list[str]:

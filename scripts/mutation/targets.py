@@ -25,6 +25,8 @@ TARGETS: Final = (
         DECISION,
         ("decide_misfit", "is_worth_nothing", "named_cause", "MisfitDecision.largest_px", "_SHIFTS", "_SAYS_NOTHING"),
     ),
+    Target("audit/decision/rejections.py", ("unit/test_rejections.py",)),
+    Target("audit/decision/triage.py", ("unit/test_decision_triage.py",)),
     Target("audit/decision/severity.py", DECISION, ("severity_of", "worth_of", "worth_severity", "_ALWAYS_HARD")),
     Target(
         "audit/decision/diagnostics.py",

@@ -86,6 +86,10 @@ def test_types_are_design_s(column):  # noqa: C901 # one branch per kind of colu
         numbers = ("gain", "worth_deg", "worth_centre", "worth_focal_rel")
         texts = ("group", "status")
         wanted = pa.list_(pa.struct({**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())}))
+    elif column.name == "diagnoses":
+        kinds = dict.fromkeys(("text", "action", "command"), pa.string())
+        first = {"code": pa.string(), "camera_id": pa.uint32(), "severity": pa.string(), "num_images": pa.int64()}
+        wanted = pa.list_(pa.struct({**first, "examples": pa.list_(pa.string()), **kinds}))
     elif column.name == "findings":
         wanted = pa.list_(pa.struct({"code": pa.string(), "count": pa.int64(), "text": pa.string()}))
     else:
