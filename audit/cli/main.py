@@ -17,6 +17,7 @@ VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
     "report": "Write one HTML page about a run, to look at and to send.",
     "explain": "Tell one image's whole story, as text and pictures.",
+    "diagnose": "Say why models are judged as they are; try refits.",
     "explain-code": "Say what a reason code or finding means, and what to do.",
     "check": "Pass or fail a run by a gate file, for nightly builds.",
     "learn-band": "Learn what repeated reconstructions differ by, as a gate file.",
