@@ -8,8 +8,9 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parents[2]
-# They judge or pack the code and are not run by it: their bounds are the versions last seen to pass.
+# They judge, pack or show the code and are not run by it: their bounds are the versions last seen to pass.
 LINTERS = {"hatchling", "import-linter", "mypy", "pandas-stubs", "pyarrow-stubs", "ruff", "scipy-stubs", "types-tqdm"}
+LINTERS |= {"ipykernel", "nbclient", "nbformat"}
 
 
 def versions(lines, operator):
