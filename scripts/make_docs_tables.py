@@ -127,7 +127,7 @@ the same list and decide nothing: an accepted image may carry them. A code leads
 - KS and `verdict_noise` judge the noise, misfit the camera. KS rejects a correct camera whose noise is not what the
   model of the noise says, and with few observations it accepts a wrong lens.
 - An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration (a repeated facade
-  matched to the wrong copy), global scale, or drift.
+  matched to the wrong copy), global scale, or drift. What witnesses outside see of it: docs/witnesses.md.
 - A pose that was adjusted together with its error is at its optimum: `verdict_pose` finds poses that were changed, or
   not adjusted, afterwards.
 - Effects below `--min-effect` are no reason to reject, however significant they are; in the tables they stand all the

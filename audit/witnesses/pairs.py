@@ -29,6 +29,8 @@ THRESHOLD_SIGMAS: Final = 8.0
 MIN_THRESHOLD_PX: Final = 1.0
 MAX_HEALTHY_RATE: Final = 0.01
 """Share of a healthy model's strong pairs that may contradict: 0 of 980 simulated and 0 of 27 real ones do."""
+MIN_PAIRS: Final = 3
+"""Pairs from which on an image is spoken of: one contradicted pair does not say which of its two images is wrong."""
 MAX_SHARE: Final = 0.5
 """Share of an image's pairs above which another place would satisfy more of them than its own."""
 _LEVEL: Final = 0.01  # of the finding
@@ -55,10 +57,10 @@ def pairs_report(evidence: Evidence, counts: PairCounts, threshold_px: float) ->
     against = strong & (2 * counts.num_far > counts.num_matches)
     near = strong & evidence.seen.shares(counts.image_idx, MIN_SHARED)
     num_near, num_against = (_per_image(model, counts, kept) for kept in (near, near & against))
-    p = contradiction_p(num_near, num_against)
+    p = np.where(num_near >= MIN_PAIRS, contradiction_p(num_near, num_against), np.nan)
     q = benjamini_hochberg(p)
     said = tuple(
-        _statement(int(n), int(k), float(value)) if n else None
+        _statement(int(n), int(k), float(value)) if n >= MIN_PAIRS else None
         for n, k, value in zip(num_near, num_against, q, strict=True)
     )
     columns: dict[str, ColumnValues] = {

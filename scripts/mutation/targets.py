@@ -20,6 +20,12 @@ TARGETS: Final = (
         DECISION,
         ("judge_camera", "_judge_own", "material_step", "_not_optimal", "pose_alone", "_MOST"),
     ),
+    Target("audit/decision/outside.py", ("unit/test_decision_outside.py",)),
+    Target(
+        "audit/table/witnesses.py",
+        ("unit/test_decision_outside.py",),
+        ("WitnessWords.may_reject", "wilson_upper", "MAX_FALSE_ALARMS"),
+    ),
     Target(
         "audit/decision/misfit.py",
         DECISION,

@@ -6,10 +6,12 @@ import sqlite3
 from contextlib import closing
 
 import numpy as np
+import pyarrow.parquet as pq
 import pycolmap
 import pytest
 from model_writer import Camera, Image, Model, Point, write_binary
 
+from sfm_audit.audit.cli.main import main
 from sfm_audit.loaders import LoadError, MalformedFileError, open_model
 from sfm_audit.loaders.colmap.pairs import DatabasePairs, RefusedPairs, database_pairs
 
@@ -164,3 +166,21 @@ def test_auto_without_a_database_says_so_when_it_is_asked(model):
 def test_a_named_database_has_to_be_there(model, tmp_path):
     with pytest.raises(LoadError, match=r"nothing\.db"):
         database_pairs(model, str(tmp_path / "nothing.db"), "scene")
+
+
+def test_the_command_line_asks_the_database_beside_the_model(tmp_path, model, path):
+    del path
+    assert main(["run", model.location, "-o", str(tmp_path / "run"), "--database", "auto", "--quiet"]) == 0
+    rows = pq.read_table(tmp_path / "run" / "models").to_pylist()
+    assert rows[0]["witnesses"] == ["pairs"]
+    assert pq.read_table(tmp_path / "run" / "images")["num_pairs_strong"].to_pylist() == [0, 0, 0]
+
+
+def test_the_command_line_says_where_there_is_no_database(tmp_path, model, capsys):
+    assert main(["run", model.location, "-o", str(tmp_path / "run"), "--database", "auto", "--quiet"]) == 0
+    rows = pq.read_table(tmp_path / "run" / "models").to_pylist()
+    assert rows[0]["witnesses"] is None
+    assert [each["code"] for each in rows[0]["findings"]].count("database_not_used") == 1
+    named = ["--database", str(tmp_path / "nothing.db"), "--quiet"]
+    assert main(["run", model.location, "-o", str(tmp_path / "other"), *named]) == 3
+    assert "nothing.db" in capsys.readouterr().err

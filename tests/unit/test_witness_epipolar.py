@@ -8,10 +8,11 @@ import numpy as np
 import pycolmap
 import pytest
 from numpy.testing import assert_allclose
-from pair_samples import OwnPairs, moved_image
+from pair_samples import moved_image
 from scipy.optimize import minimize
 
 from sfm_audit.audit.simulate.adjust import sparse_model, true_claim
+from sfm_audit.audit.simulate.matches import OwnPairs
 from sfm_audit.audit.simulate.noise import NoiseSpec
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 from sfm_audit.audit.witnesses.epipolar import count_far, sampson_px

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pair_samples import OwnPairs, moved_image
+from pair_samples import moved_image
 from scipy.stats import binom
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.simulate.adjust import sparse_model, true_claim
+from sfm_audit.audit.simulate.matches import OwnPairs
 from sfm_audit.audit.simulate.noise import NoiseSpec
 from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
 from sfm_audit.audit.table.witnesses import Witness
@@ -128,10 +129,13 @@ def test_a_pair_contradicts_where_most_of_at_least_60_matches_do(model, num_far,
     assert columns["num_pairs_contradicting"][:3].tolist() == [against, against, 0]
 
 
-def test_images_without_a_strong_pair_are_not_spoken_of(model):
-    said = pairs_report(evidence_of(model), counts_of([(0, 1)]), 4.0).testimonies
-    assert [each is None for each in said] == [False, False, *[True] * 8]
-    assert said[0].witness is Witness.PAIRS
+def test_images_with_fewer_than_three_strong_pairs_are_not_spoken_of(model):
+    """Of two images that contradict each other nobody knows which one is wrong."""
+    report = pairs_report(evidence_of(model), counts_of([(0, 1), (0, 2), (1, 2), (0, 3)], far=[0]), 4.0)
+    assert [each is None for each in report.testimonies] == [False, *[True] * 9]
+    assert (report.testimonies[0].witness, report.testimonies[0].score) == (Witness.PAIRS, 1 / 3)
+    assert [np.isnan(value) for value in report.columns["pairs_p"]] == [False, *[True] * 9]
+    assert report.columns["num_pairs_covisible"][:4].tolist() == [3, 2, 2, 1]
 
 
 @pytest.mark.parametrize(("num_far", "found"), [(0, 0), (1, 0), (3, 1)])
