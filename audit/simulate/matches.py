@@ -31,7 +31,8 @@ class OwnPairs:
         """Return (m, 2) the 2D points with which two images see the same points."""
         table = self._model.observations
         rows = [slice(*table.offsets[i : i + 2]) for i in (first, second)]
-        _, *at = np.intersect1d(*(table.point_idx[each] for each in rows), return_indices=True)
+        seen = [table.point_idx[each] for each in rows]
+        _, *at = np.intersect1d(seen[0], seen[1], return_indices=True)
         idx = [table.point2d_idx[each][positions] for each, positions in zip(rows, at, strict=True)]
         return np.column_stack(idx).astype(np.uint32)
 
