@@ -124,8 +124,8 @@ def _add(tally: Tally, model: SparseModel, source: PairSource, rng: np.random.Ge
     tally.images += len(model.images)
     tally.spoken_of += sum(each is not None for each in report.testimonies)
     tally.against += int(against.sum())
-    tally.strong += int(np.sum(report.columns["num_pairs_strong"])) // 2
-    tally.contradicted += int(np.sum(report.columns["num_pairs_contradicting"])) // 2
+    tally.strong += sum(map(int, report.columns["num_pairs_strong"])) // 2
+    tally.contradicted += sum(map(int, report.columns["num_pairs_contradicting"])) // 2
     tally.found += any(each.code is FindingCode.CONTRADICTED_PAIRS for each in report.findings)
     spoken_of = np.flatnonzero([each is not None for each in report.testimonies])
     for image_idx in rng.permutation(spoken_of)[:num_moved].tolist():
