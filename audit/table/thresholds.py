@@ -59,6 +59,21 @@ MIN_SHIFT_WORTH_FOCAL_REL: Final = 0.003
 """What a principal point or its twin, tangential distortion, has to be worth: share of the median depth, share of f.
 Degrees say nothing there: a rotation is what takes a shift up (docs/realtruth.md)."""
 
+MIN_SHARED_POINTS: Final = 15
+"""Points that two images share that hang together; fewer than the next number hold them weakly."""
+WELL_SHARED_POINTS: Final = 30
+MIN_STRONG_MATCHES: Final = 60
+"""Verified matches of a strong pair: of healthy real pairs with fewer, 4 of 16 contradict (method.md section 13)."""
+PAIR_THRESHOLD_SIGMAS: Final = 8.0
+MIN_PAIR_THRESHOLD_PX: Final = 1.0
+"""A match is far off above so many sigma of the model, and above so many px."""
+MAX_HEALTHY_PAIR_RATE: Final = 0.01
+"""Share of a healthy model's strong pairs that may contradict: 0 of 980 simulated and 0 of 27 real ones do."""
+MIN_STRONG_PAIRS: Final = 3
+"""Pairs from which on an image is spoken of: one contradicted pair does not say which of its two images is wrong."""
+MAX_CONTRADICTING_SHARE: Final = 0.5
+"""Share of an image's pairs above which another place would satisfy more of them than its own."""
+
 
 def effect_px(min_effect: str, sigma_px: float | None) -> float | None:
     """Return tau in px of a min_effect such as 0.2px or 0.5sigma; None where sigma is asked for and not known."""

@@ -6,15 +6,12 @@ from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.table.thresholds import MIN_SHARED_POINTS, WELL_SHARED_POINTS
 from sfm_audit.audit.witnesses.covisibility import Covisibility, Cuts, cuts_of
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
 from sfm_audit.loaders.arrays import IntArray
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
-MIN_SHARED: Final = 15
-"""Shared points that hold two images together."""
-MIN_SHARED_WELL: Final = 30
-"""Shared points below which they hold together weakly."""
 _SHOWN: Final = 3
 
 
@@ -22,11 +19,11 @@ def ask_connectivity(evidence: Evidence) -> WitnessReport:
     """Return neighbours and strongest neighbour of each image, and where the model falls apart."""
     model = evidence.model
     seen = evidence.seen
-    graph, well = (_with_frames(seen.at_least(num), model) for num in (MIN_SHARED, MIN_SHARED_WELL))
+    graph, well = (_with_frames(seen.at_least(num), model) for num in (MIN_SHARED_POINTS, WELL_SHARED_POINTS))
     cuts = cuts_of(graph)
     parts = graph.components()
     columns: dict[str, ColumnValues] = {
-        "num_neighbours": seen.at_least(MIN_SHARED).degree(),
+        "num_neighbours": seen.at_least(MIN_SHARED_POINTS).degree(),
         "num_shared_strongest": seen.strongest(),
         "covisible_part": parts,
         "is_articulation": cuts.articulation,
@@ -52,8 +49,8 @@ def _disconnected(model: SparseModel, parts: IntArray) -> tuple[Finding, ...]:
     if len(sizes) < 2:
         return ()
     text = (
-        f"{len(sizes)} parts of {_sizes(sizes)} images that share fewer than {MIN_SHARED} points with each other: "
-        f"nothing holds {_named(model, np.flatnonzero(parts != 0))} where they are relative to the largest"
+        f"{len(sizes)} parts of {_sizes(sizes)} images that share fewer than {MIN_SHARED_POINTS} points with each "
+        f"other: nothing holds {_named(model, np.flatnonzero(parts != 0))} where they are relative to the largest"
     )
     return (Finding(FindingCode.DISCONNECTED, len(sizes), text),)
 
@@ -64,7 +61,7 @@ def _weakly(model: SparseModel, parts: IntArray, well: IntArray, cuts: Cuts) -> 
     num_more = int(well.max(initial=0)) - int(parts.max(initial=0))
     if num_more > 0:
         apart = np.flatnonzero(_lost(parts, well))
-        said.append(f"{num_more} more parts at {MIN_SHARED_WELL} shared points ({_named(model, apart)})")
+        said.append(f"{num_more} more parts at {WELL_SHARED_POINTS} shared points ({_named(model, apart)})")
     if len(cuts.bridges):
         names = [" - ".join(model.images.name[i] for i in pair) for pair in cuts.bridges[:_SHOWN].tolist()]
         said.append(f"{len(cuts.bridges)} pairs without which it falls apart ({_listed(names, len(cuts.bridges))})")

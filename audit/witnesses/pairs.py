@@ -13,6 +13,15 @@ import numpy as np
 from scipy.special import bdtrc
 
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
+from sfm_audit.audit.table.thresholds import (
+    MAX_CONTRADICTING_SHARE,
+    MAX_HEALTHY_PAIR_RATE,
+    MIN_PAIR_THRESHOLD_PX,
+    MIN_SHARED_POINTS,
+    MIN_STRONG_MATCHES,
+    MIN_STRONG_PAIRS,
+    PAIR_THRESHOLD_SIGMAS,
+)
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
 from sfm_audit.audit.witnesses.epipolar import PairCounts, count_far
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
@@ -21,18 +30,6 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.errors import LoadError
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
-MIN_STRONG: Final = 60
-"""Matches of a strong pair: of healthy real pairs with fewer, 4 of 16 contradict."""
-MIN_SHARED: Final = 15
-"""Points that covisible images share."""
-THRESHOLD_SIGMAS: Final = 8.0
-MIN_THRESHOLD_PX: Final = 1.0
-MAX_HEALTHY_RATE: Final = 0.01
-"""Share of a healthy model's strong pairs that may contradict: 0 of 980 simulated and 0 of 27 real ones do."""
-MIN_PAIRS: Final = 3
-"""Pairs from which on an image is spoken of: one contradicted pair does not say which of its two images is wrong."""
-MAX_SHARE: Final = 0.5
-"""Share of an image's pairs above which another place would satisfy more of them than its own."""
 _LEVEL: Final = 0.01  # of the finding
 _SHOWN: Final = 3
 
@@ -42,7 +39,9 @@ def ask_pairs(evidence: Evidence) -> WitnessReport | None:
     if evidence.pairs is None:
         return None
     sigma_px = np.nanmedian(evidence.sigma_px) if np.isfinite(evidence.sigma_px).any() else np.nan
-    threshold_px = max(THRESHOLD_SIGMAS * float(sigma_px), MIN_THRESHOLD_PX) if sigma_px > 0 else MIN_THRESHOLD_PX
+    threshold_px = (
+        max(PAIR_THRESHOLD_SIGMAS * float(sigma_px), MIN_PAIR_THRESHOLD_PX) if sigma_px > 0 else MIN_PAIR_THRESHOLD_PX
+    )
     try:
         counts = count_far(evidence.model, evidence.pairs, threshold_px)
     except LoadError as error:
@@ -53,14 +52,14 @@ def ask_pairs(evidence: Evidence) -> WitnessReport | None:
 def pairs_report(evidence: Evidence, counts: PairCounts, threshold_px: float) -> WitnessReport:
     """Return what the pairs say of each image and of the model."""
     model = evidence.model
-    strong = counts.num_matches >= MIN_STRONG
+    strong = counts.num_matches >= MIN_STRONG_MATCHES
     against = strong & (2 * counts.num_far > counts.num_matches)
-    near = strong & evidence.seen.shares(counts.image_idx, MIN_SHARED)
+    near = strong & evidence.seen.shares(counts.image_idx, MIN_SHARED_POINTS)
     num_near, num_against = (_per_image(model, counts, kept) for kept in (near, near & against))
-    p = np.where(num_near >= MIN_PAIRS, contradiction_p(num_near, num_against), np.nan)
+    p = np.where(num_near >= MIN_STRONG_PAIRS, contradiction_p(num_near, num_against), np.nan)
     q = benjamini_hochberg(p)
     said = tuple(
-        _statement(int(n), int(k), float(value)) if n >= MIN_PAIRS else None
+        _statement(int(n), int(k), float(value)) if n >= MIN_STRONG_PAIRS else None
         for n, k, value in zip(num_near, num_against, q, strict=True)
     )
     columns: dict[str, ColumnValues] = {
@@ -85,15 +84,14 @@ def contradiction_p(num_pairs: IntArray, num_against: IntArray) -> FloatArray:
     rest = 0.5 * num_pairs.sum() - num_pairs
     rest_against = 0.5 * num_against.sum() - num_against
     with np.errstate(all="ignore"):
-        rate = np.where(rest > 0, rest_against / rest, 0.0)
-        rate = np.clip(rate, MAX_HEALTHY_RATE, 1.0)
-        p = np.where(num_against > 0, bdtrc(num_against - 1, np.maximum(num_pairs, 1), rate), 1.0)
+        rate = np.maximum(np.nan_to_num(rest_against / rest), MAX_HEALTHY_PAIR_RATE)  # 0 / 0: no other pair
+        p = bdtrc(num_against - 1, num_pairs, rate)
     return np.where(num_pairs > 0, p, np.nan)
 
 
 def _statement(num: int, num_against: int, q: float) -> WitnessStatement:
     text = f"{num_against} of {num} strong pairs with covisible images contradict its camera, q = {q:.2g}"
-    return WitnessStatement(Witness.PAIRS, num_against / num, MAX_SHARE, text, q)
+    return WitnessStatement(Witness.PAIRS, num_against / num, MAX_CONTRADICTING_SHARE, text, q)
 
 
 def _per_image(model: SparseModel, counts: PairCounts, kept: BoolArray) -> IntArray:
@@ -106,7 +104,7 @@ def _findings(
     """Return that more strong pairs contradict than in a healthy model, and the two sides of the seam."""
     strong, against = strong_against
     num, num_against = int(strong.sum()), int(against.sum())
-    if num_against < 2 or not bdtrc(num_against - 1, num, MAX_HEALTHY_RATE) < _LEVEL:
+    if num_against < 2 or not bdtrc(num_against - 1, num, MAX_HEALTHY_PAIR_RATE) < _LEVEL:
         return ()
     sides = seam_of(counts.image_idx[strong], against[strong])
     shown = " | ".join(_named(model, side) for side in sides)

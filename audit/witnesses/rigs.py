@@ -8,12 +8,12 @@ import numpy as np
 
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
+from sfm_audit.audit.table.thresholds import MAX_POSE_OFFSET_PX, MIN_OBSERVATIONS
 from sfm_audit.audit.witnesses.evidence import Evidence, WitnessReport
 from sfm_audit.loaders.model import Finding, FindingCode
 
-MAX_OFFSET_PX: Final = 0.5
-"""What moving an image alone would remove; as for images that no rig places (verdict_pose)."""
-MIN_INLIERS: Final = 20
+_LIMIT_PX: Final = MAX_POSE_OFFSET_PX.default  # as for images that no rig places (verdict_pose)
+_MIN_INLIERS: Final = int(MIN_OBSERVATIONS.default)
 
 
 def ask_rigs(evidence: Evidence) -> WitnessReport | None:
@@ -28,10 +28,10 @@ def ask_rigs(evidence: Evidence) -> WitnessReport | None:
     offset_px = np.full(len(model.images), np.nan)
     for image_idx in range(len(model.images)):
         rows = residuals.rows(image_idx)
-        if rows.stop - rows.start >= MIN_INLIERS:
+        if rows.stop - rows.start >= _MIN_INLIERS:
             own = image_inliers(model, residuals, image_idx)
             offset_px[image_idx] = pose_offset_px(own.residuals_px, own.jacobian_cam, own.xyz_cam)
-    moved = offset_px > MAX_OFFSET_PX
+    moved = offset_px > _LIMIT_PX
     asked = np.isfinite(offset_px)
     said = []
     for camera_id in np.unique(model.images.camera_id[moved]).tolist():

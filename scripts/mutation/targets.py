@@ -21,6 +21,7 @@ TARGETS: Final = (
         ("judge_camera", "_judge_own", "material_step", "_not_optimal", "pose_alone", "_MOST"),
     ),
     Target("audit/decision/outside.py", ("unit/test_decision_outside.py",)),
+    Target("audit/witnesses/pairs.py", ("unit/test_witness_pairs.py",), ("contradiction_p", "_statement")),
     Target(
         "audit/table/witnesses.py",
         ("unit/test_decision_outside.py",),
