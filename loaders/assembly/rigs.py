@@ -145,10 +145,12 @@ def _other_poses(images: RawImages, placed: FloatArray) -> tuple[Finding, ...]:
     if not count:
         return ()
     worst = int(np.nanargmax(np.where(differs, turned_deg, -1.0)))
+    moved = shifted[differs & np.isfinite(shifted)]  # none where all cameras are in one place
+    far = f", {moved.max():.3g} of the cameras' extent" if moved.size else ""
     text = (
         f"the images file has other poses than frames and rigs, which were read, for {count} of {len(placed)} images: "
-        f"up to {turned_deg[worst]:.3g} degrees (image {images.image_id[worst]}), {np.nanmax(shifted[differs]):.3g} of "
-        f"the cameras' extent; programs that read the images file alone see another model"
+        f"up to {turned_deg[worst]:.3g} degrees (image {images.image_id[worst]}){far}; programs that read the images "
+        f"file alone see another model"
     )
     return (Finding(FindingCode.RIG_POSE_DISAGREES, count, text),)
 

@@ -58,6 +58,13 @@ def test_a_stale_pose_is_named(tmp_path, image_id):
     assert f"for 1 of 8 images: up to 2 degrees (image {image_id})" in finding.text
 
 
+def test_a_place_that_is_no_number_leaves_the_angle(tmp_path):
+    _, poses = frames_and_poses()
+    turned = Rotation.from_euler("x", 2, degrees=True) * Rotation.from_quat(np.roll(poses[4][:4], -1))
+    (finding,) = found(tmp_path, {4: (*np.roll(turned.as_quat(), 1), np.nan, np.nan, np.nan)})
+    assert "up to 2 degrees (image 4); programs" in finding.text
+
+
 def test_a_shifted_pose_is_one_too(tmp_path):
     _, poses = frames_and_poses()
     shifted = (*poses[2][:4], *(np.array(poses[2][4:]) + np.array([0.0, 0.0, 0.1])))
