@@ -25,7 +25,12 @@ VENV = ROOT / ".venv"
 INTERPRETER = VENV / "bin" / "python"
 MARKER = VENV / ".installing"
 LOCK = VENV / ".lock"
-REQUIREMENTS = {"base": (".", ["base"]), "dev": (".[dev]", ["base", "dev"])}  # what pip is told, what is then installed
+EXTRAS = ["report", "calibrate", "cluster"]
+REQUIREMENTS = {  # what pip is told, what is then installed
+    "base": (".", ["base"]),
+    **{extra: (f".[{extra}]", ["base", extra]) for extra in EXTRAS},
+    "dev": (".[dev]", ["base", *EXTRAS, "dev"]),
+}
 EXIT_UNAVAILABLE = 69
 EXIT_INTERRUPTED = 130
 
@@ -143,10 +148,13 @@ def install(extra: str, python: str, lock: int) -> None:
         return
     reusable = is_reusable(version)
     MARKER.touch()
-    if reusable:
+    if extra in EXTRAS:
+        say(f"Installing what this needs into .venv (extra {extra}, first use) ...")
+    elif reusable:
         say("Updating .venv ...")
     else:
         say("Installing into .venv (first use, about a minute) ...")
+    if not reusable:
         empty_venv()
         create_venv(python, lock)
     requirement, stamped = REQUIREMENTS[extra]

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
 
 import click
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
+from sfm_audit.audit.cli.journal import note
 from sfm_audit.audit.cli.progress import Progress
 from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
@@ -24,13 +24,12 @@ from sfm_audit.audit.schedule.errors import ClusterError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
 from sfm_audit.audit.schedule.runner import audit_many
 from sfm_audit.audit.schedule.task import NO_LIMITS, Failure, Limits
-from sfm_audit.loaders import Discovery
+from sfm_audit.loaders import Discovery, ModelRef
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.record import INPUT_KINDS
 from sfm_audit.reports.run_folder.store import RunFailure, RunSettings, RunStore
 from sfm_audit.reports.text.summary import render_summary
-
-_INPUT_KINDS: Final = frozenset({"unreadable", "too_large"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +64,8 @@ def run_audit(request: RunRequest, found: Discovery) -> ExitCode:
     if request.dask is not None and importlib.util.find_spec("distributed") is None:
         raise KnownError("--dask needs the extra cluster: pip install 'sfm-audit[cluster]'", ExitCode.USAGE)
     start = time.perf_counter()
+    num_bytes = sum(ref.num_bytes for ref in found.refs)
+    note(f"run {' '.join(request.paths)} -o {request.folder}: {len(found.refs)} models, {num_bytes / 1e6:.1f} MB")
     problems = [RunFailure(error.path, str(error)) for error in found.errors]
     if found.refs:
         try:
@@ -82,7 +83,7 @@ def _say(problems: Sequence[RunFailure], folder: Path) -> ExitCode:
     for problem in problems:
         where = f" ({folder / problem.report})" if problem.report else ""
         complain(problem.message + where)
-        codes.append(ExitCode.UNREADABLE_INPUT if problem.kind in _INPUT_KINDS else ExitCode.AUDIT_STOPPED)
+        codes.append(ExitCode.UNREADABLE_INPUT if problem.kind in INPUT_KINDS else ExitCode.AUDIT_STOPPED)
     return max(codes)
 
 
@@ -118,13 +119,22 @@ def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure]
         return RunFailure(failure.location, failure.message, failure.kind, store.reports.get(failure.location))
 
     with store, Progress(found.refs, silent=silent) as progress:
+
+        def on_done(ref: ModelRef) -> None:
+            progress.advance(ref)
+            note(f"audited {ref.model_path} after {time.perf_counter() - start:.1f} s")
+
+        def on_skip(ref: ModelRef) -> None:
+            progress.skip(ref)
+            note(f"unchanged, kept {ref.model_path}")
+
         failures = audit_many(
             found.refs,
             request.config,
             jobs=request.jobs or _sensible_jobs(found),
             sink=store,
-            on_done=progress.advance,
-            on_skip=progress.skip,
+            on_done=on_done,
+            on_skip=on_skip,
             on_failure=lambda failure: problems.append(as_said(failure)),
             observations=request.observations,
             dask=request.dask,

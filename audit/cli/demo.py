@@ -75,6 +75,8 @@ def _simulate(out: Path, seed: int) -> list[TruthRecord]:
 
 def _refuse_foreign_folder(out: Path) -> None:
     """Let nobody lose a folder that is not an earlier demo."""
+    if out.exists() and not out.is_dir():
+        raise KnownError(f"{out}: is a file, and a demo is a folder; choose another -o", ExitCode.OUTPUT)
     if not out.is_dir() or not any(out.iterdir()):
         return
     try:

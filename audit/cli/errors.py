@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 from enum import IntEnum
 from typing import Final
 
+LOGGER: Final = logging.getLogger("sfm_audit")
+LOGGER.addHandler(logging.NullHandler())  # silent, unless --log-file or -v asks
 _MAX_CHARACTERS: Final = 900  # of one line
 
 
@@ -50,5 +53,6 @@ def complain(message: str) -> None:
     if len(line) > _MAX_CHARACTERS:
         line = f"{line[: _MAX_CHARACTERS * 2 // 3]} ... {line[-_MAX_CHARACTERS // 3 :]}"
     line = "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in line)
+    LOGGER.error("%s", line)
     with contextlib.suppress(OSError):  # the terminal may be gone, as after SIGHUP
         print(f"sfm-audit: {line}", file=sys.stderr, flush=True)

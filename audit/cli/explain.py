@@ -13,6 +13,7 @@ from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.runs import open_run
 from sfm_audit.audit.cli.settings import read_config
+from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.terminal import print_page
 from sfm_audit.audit.config import NoiseName, PointsName
 from sfm_audit.audit.table import TABLES
@@ -167,7 +168,8 @@ def _image_idx(model: SparseModel, image: str) -> int:
         return model.image_idx(image)
     except KeyError as error:
         names = ", ".join(plain(name) for name in model.images.name[:3])
-        problem = f"{model.location}: has no image {plain(image)!r}; it has {names} ... (or id:<image_id>)"
+        hint = plain(did_you_mean(image, model.images.name)).removesuffix("?")
+        problem = f"{model.location}: has no image {plain(image)!r}{hint}; it has {names} ... (or id:<image_id>)"
         raise KnownError(problem, ExitCode.USAGE) from error
 
 

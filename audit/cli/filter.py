@@ -14,6 +14,7 @@ import numpy as np
 from sfm_audit.audit.cli.again import Again, with_again
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.runs import open_run
+from sfm_audit.audit.cli.terminal import is_stdout, print_page, write_stdout
 from sfm_audit.loaders import LoadError, open_model
 from sfm_audit.loaders.scene_info.file import read_scene_info
 from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
@@ -54,7 +55,7 @@ class _Request:
     show_default=True,
     help="Keep all that was not rejected, or only what was accepted.",
 )
-@click.option("--list", "list_out", metavar="F", type=_PATH, help="Write the names of the kept images.")
+@click.option("--list", "list_out", metavar="F", type=_PATH, help="Write the names of the kept images; - is stdout.")
 @click.option("--model", metavar="MODEL", type=_PATH, help="A COLMAP model that RUN audited ...")
 @click.option("--model-out", metavar="DIR", type=_PATH, help="... and where to write it without the other images.")
 @click.option("--scene-info", metavar="F", type=_PATH, help="A scene_info file of LoFTR, D2-Net or glue-factory ...")
@@ -75,7 +76,7 @@ def command(
 ) -> ExitCode:
     """Write what the verdicts in the run folder RUN leave of a dataset.
 
-    What was removed, and why, is written beside each output as <output>.removed.csv. docs/filtering.md says what
+    What was removed, and why, is written beside each output file as <output>.removed.csv. docs/filtering.md says what
     exactly is kept.
 
     Exit codes: 0 fine; 2 wrong usage, RUN does not hold the model, or an output exists; 3 RUN is none, or the model or
@@ -89,7 +90,10 @@ def command(
         raise click.UsageError(
             "Nothing to write: give --list, --model and --model-out, or --scene-info and --scene-info-out."
         )
-    _check_outputs(outputs, [path for path in (run_folder, model, scene_info) if path is not None], model_out, force)
+    _refuse_stdout(model_out, "model-out")
+    _refuse_stdout(scene_info_out, "scene-info-out")
+    given = [path for path in (run_folder, model, scene_info) if path is not None]
+    _check_outputs([path for path in outputs if not is_stdout(path)], given, model_out, force)
     request = _open(run_folder, Keep(keep), Again.of(**again))
     steps: list[Callable[[], str]] = []
     if list_out is not None:
@@ -98,7 +102,12 @@ def command(
         steps.append(lambda: _write_model(request, model, model_out))
     if scene_info is not None and scene_info_out is not None:
         steps.append(lambda: _write_scene_info(request, scene_info, scene_info_out))
-    return _run(steps)
+    return _run(steps, is_stdout_taken=is_stdout(list_out))
+
+
+def _refuse_stdout(path: Path | None, name: str) -> None:
+    if is_stdout(path):
+        raise click.UsageError(f"--{name} cannot be - (stdout): it is written with a list of what was removed.")
 
 
 def _check_outputs(outputs: Sequence[Path], inputs: Sequence[Path], model_out: Path | None, force: bool) -> None:
@@ -131,12 +140,12 @@ def _open(run_folder: Path, keep: Keep, again: Again) -> _Request:
         raise KnownError(str(error), ExitCode.USAGE) from error
 
 
-def _run(steps: Sequence[Callable[[], str]]) -> ExitCode:
+def _run(steps: Sequence[Callable[[], str]], *, is_stdout_taken: bool) -> ExitCode:
     """Take each step, whatever becomes of the others; the gravest exit code is the answer."""
     codes = [ExitCode.OK]
     for step in steps:
         try:
-            click.echo(plain(step()))
+            print_page(plain(step()), to_stderr=is_stdout_taken)
             continue
         except LoadError as error:
             message, code = str(error), ExitCode.UNREADABLE_INPUT
@@ -153,6 +162,9 @@ def _run(steps: Sequence[Callable[[], str]]) -> ExitCode:
 
 def _write_list(request: _Request, out: Path) -> str:
     text = list_text(request.run, request.images, request.keep)
+    if is_stdout(out):
+        write_stdout(as_bytes(text))
+        return f"stdout: {_how_many(request.images, request.keep)}"
     write_file(_removed_path(out), as_bytes(removed_text(_removed(request.images, request.keep))))
     write_file(out, as_bytes(text))
     return f"{out}: {_how_many(request.images, request.keep)}"

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.toml_file import read_toml, shown
 from sfm_audit.audit.table.words import ReasonCode
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits, PartPolicy
@@ -38,7 +39,9 @@ def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
     codes = {str(code) for code in ReasonCode}
     for code in policy.reason_codes:
         if code not in codes:
-            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code[:80]}; docs/verdicts.md lists them"
+            hint = did_you_mean(code, codes)
+            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code[:80]}"
+            problem += hint or "; docs/verdicts.md lists them"
             raise KnownError(problem, ExitCode.USAGE)
     if policy.needs_baseline and not has_baseline:
         raise KnownError(f"{file}: {policy.needs_baseline} needs --baseline RUN0", ExitCode.USAGE)
@@ -49,7 +52,9 @@ def _problem(detail: ErrorDetails) -> str:
     name = _dotted(detail["loc"])
     if detail["type"] == "extra_forbidden":
         known: Any = next((_KEYS_OF[part] for part in reversed(detail["loc"][:-1]) if part in _KEYS_OF), GatePolicy)
-        return f"unknown key {name}; expected one of {', '.join(known.model_fields)}"
+        keys = known.model_fields
+        hint = did_you_mean(str(detail["loc"][-1]), keys) or f"; expected one of {', '.join(keys)}"
+        return f"unknown key {name}{hint}"
     if detail["type"] == "missing":
         return f"{name} is missing"
     wanted = detail["msg"].removeprefix("Input should be ")

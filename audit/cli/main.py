@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import signal
 import sys
 from collections.abc import Sequence
@@ -11,7 +12,9 @@ from typing import Final, cast
 
 import click
 
-from sfm_audit.audit.cli.errors import Ended, ExitCode, KnownError, complain
+from sfm_audit.audit.cli.errors import LOGGER, Ended, ExitCode, KnownError, complain
+from sfm_audit.audit.cli.journal import journal, note, with_journal
+from sfm_audit.audit.cli.suggestions import did_you_mean
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -51,9 +54,18 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in VERBS:
             return None
-        return cast(
-            "click.Command", importlib.import_module(f"sfm_audit.audit.cli.{cmd_name.replace('-', '_')}").command
-        )
+        module = importlib.import_module(f"sfm_audit.audit.cli.{cmd_name.replace('-', '_')}")
+        return with_journal(cast("click.Command", module.command))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the verb, or say which one was probably meant."""
+        if args[0] not in VERBS and not args[0].startswith("-"):
+            known = ", ".join(VERBS)
+            hint = did_you_mean(args[0], VERBS) or f"; the commands are {known}"
+            ctx.fail(f"No such command {args[0]!r}{hint}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""
@@ -70,6 +82,18 @@ def cli() -> None:
 
 def main(args: Sequence[str]) -> int:
     """Run one command and return its exit code; errors nobody expected keep their traceback."""
+    with journal():
+        try:
+            code = _answer(args)
+        except Exception:
+            LOGGER.exception("a bug in sfm-audit %s", importlib.metadata.version("sfm-audit"))
+            raise
+        note(f"exit code {code}")
+        return code
+
+
+def _answer(args: Sequence[str]) -> int:
+    """Run one command; a known error is one line."""
     try:
         code = cli.main(list(args) or ["--help"], prog_name="sfm-audit", standalone_mode=False, obj=tuple(args))
     except KnownError as error:

@@ -9,10 +9,10 @@ from typing import Any
 import click
 
 from sfm_audit.audit.cli.again import Again, with_again
-from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.extras import extra
 from sfm_audit.audit.cli.runs import open_run
-from sfm_audit.audit.cli.terminal import print_page
+from sfm_audit.audit.cli.terminal import is_stdout, print_page, write_stdout
 from sfm_audit.reports.errors import OutputError, RunFolderError
 from sfm_audit.reports.run_folder.new_files import OutputExistsError, check_free, write_file
 from sfm_audit.reports.text.wording import counted, plain
@@ -20,7 +20,9 @@ from sfm_audit.reports.text.wording import counted, plain
 
 @click.command("report", short_help="Write one HTML page about a run, to look at and to send.")
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, help="- is stdout."
+)
 @click.option("--images", "photos", metavar="DIR", type=click.Path(path_type=Path), help="Folder of the photos.")
 @click.option(
     "--worst", type=click.IntRange(0, 100), default=12, show_default=True, help="How many images get pictures."
@@ -56,7 +58,8 @@ def command(
     not be written.
     """
     try:
-        check_free(out, force=force)
+        if not is_stdout(out):
+            check_free(out, force=force)
         if photos is not None and not photos.is_dir():
             raise KnownError(f"{photos}: is no folder; name the folder of the photos", ExitCode.USAGE)
         reader = Again.of(**again).read(open_run(run, quiet=quiet))
@@ -64,14 +67,22 @@ def command(
             from sfm_audit.audit.cli.report_page import make_page  # noqa: PLC0415 - needs the extra
         page = make_page(reader, photos, worst, models, silent=quiet or not sys.stderr.isatty())
         content = page.text.encode()
-        write_file(out, content)
+        if is_stdout(out):
+            write_stdout(content)
+        else:
+            write_file(out, content)
     except OutputExistsError as error:
         raise KnownError(str(error), ExitCode.USAGE) from error
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     except OutputError as error:
         raise KnownError(str(error), ExitCode.OUTPUT) from error
+    if page.num_wanted and not page.num_photos:
+        complain(
+            f"{photos}: holds none of the {counted(page.num_wanted, 'photo')} of the page; expected DIR/<name> or "
+            f"DIR/<scene>/images/<name>, such as {photos}/{page.example}"
+        )
     if not quiet:
         what = f"{counted(page.num_images, 'image')}, pictures of {page.num_drawn}, {len(content) / 1e6:.1f} MB"
-        print_page(f"{plain(str(out))}: {what}")
+        print_page(f"{'stdout' if is_stdout(out) else plain(str(out))}: {what}", to_stderr=is_stdout(out))
     return ExitCode.OK

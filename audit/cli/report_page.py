@@ -26,11 +26,17 @@ _MAX_THUMBNAILS: Final = 100  # rows with a small photo
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """The page, and what is on it."""
+    """The page, and what is on it.    num_wanted: photos that were looked for.    num_photos: photos that were found.
+
+    example: the name of one of them, or nothing.
+    """
 
     text: str
     num_images: int
     num_drawn: int
+    num_wanted: int
+    num_photos: int
+    example: str
 
 
 def make_page(run: RunReader, photos: Path | None, worst: int, named: Sequence[str] = (), *, silent: bool) -> Made:
@@ -58,7 +64,15 @@ def make_page(run: RunReader, photos: Path | None, worst: int, named: Sequence[s
             [made.views[i] for i in range(len(made.views))],
         )
     )
-    return Made(text, content.num_images, sum(bool(item.pictures) for item in made.pictures.values()))
+    num_wanted = min(len(content.rows), max(worst, _MAX_THUMBNAILS)) if photos else 0
+    return Made(
+        text,
+        content.num_images,
+        sum(bool(item.pictures) for item in made.pictures.values()),
+        num_wanted,
+        len(made.thumbnails),
+        str(content.rows[0]["image_name"]) if content.rows else "",
+    )
 
 
 class _Drawing:

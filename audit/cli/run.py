@@ -12,7 +12,7 @@ import click
 from sfm_audit.audit.cli.errors import ExitCode, complain
 from sfm_audit.audit.cli.finding import CHOICE_OF_MODELS, find_models, listed, wanted_of, with_choice_of_models
 from sfm_audit.audit.cli.settings import read_config
-from sfm_audit.audit.cli.terminal import print_page
+from sfm_audit.audit.cli.terminal import print_page, write_stdout
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
 from sfm_audit.audit.table.words import POLICIES
 
@@ -90,6 +90,7 @@ _SETTINGS = ("noise", "points", "min_effect", "policy", "database")
 @click.option("--verify", is_flag=True, help="Read all inputs again, where otherwise size and time of change count.")
 @click.option("--observations", is_flag=True, help="Write RUN/observations too, one row per inlier.")
 @click.option("--list", "only_list", is_flag=True, help="Print the models that were found, audit nothing.")
+@click.option("--json", "as_json", is_flag=True, help="Print counts and failures as JSON instead of the summary.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary; errors are still said.")
 def command(  # one parameter per option
     *, paths: tuple[str, ...], out: Path | None, config_file: Path | None, **options: Any
@@ -106,6 +107,8 @@ def command(  # one parameter per option
     """
     config = read_config(config_file, {name: options[name] for name in _SETTINGS})
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
+    if options["only_list"] and options["as_json"]:
+        raise click.UsageError("--list and --json exclude each other; --list is a table with tabs.")
     if out is None and not options["only_list"]:
         raise click.UsageError("Missing option '-o': the folder for the tables.")
     found = find_models(paths, wanted)
@@ -114,7 +117,10 @@ def command(  # one parameter per option
         print_page("\n".join(lines))
         return _refuse(problems)
     if not found.refs:
-        return _refuse([str(error) for error in found.errors])
+        exit_code = _refuse([str(error) for error in found.errors])
+        if options["as_json"]:
+            _print_json(out, exit_code)
+        return exit_code
     # what audits costs most of a second to import: --help and a wrong option, config or PATH need not wait for it
     from sfm_audit.audit.cli.auditing import RunRequest, print_summary, run_audit  # noqa: PLC0415
 
@@ -130,9 +136,17 @@ def command(  # one parameter per option
         options["verify"],
     )
     exit_code = run_audit(request, found)
-    if not options["quiet"] and (out / "run.json").exists():
+    if options["as_json"]:
+        _print_json(out, exit_code)
+    elif not options["quiet"] and (out / "run.json").exists():
         print_summary(out)
     return exit_code
+
+
+def _print_json(folder: Path, exit_code: ExitCode) -> None:
+    from sfm_audit.audit.cli.run_json import run_as_json  # noqa: PLC0415 - as above
+
+    write_stdout(run_as_json(folder, exit_code))
 
 
 def _refuse(problems: Sequence[str]) -> ExitCode:

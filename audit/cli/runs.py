@@ -11,9 +11,11 @@ import pyarrow as pa
 
 from sfm_audit.audit.cli.again import Again, under, valid_settings
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
+from sfm_audit.audit.cli.terminal import is_stdout, write_stdout
 from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
 from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.record import INPUT_KINDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +36,20 @@ class ComparedRun:
     @property
     def unread(self) -> list[tuple[str, str]]:
         """Location and message of each input that could not be read."""
-        return [(str(item["location"]), str(item["message"])) for item in self.info.get("failures", [])]
+        return self._failures(of_inputs=True)
+
+    @property
+    def stopped(self) -> list[tuple[str, str]]:
+        """Location and message of each model that a bug or a limit stopped: ``run`` ended with exit code 5."""
+        return self._failures(of_inputs=False)
+
+    def _failures(self, *, of_inputs: bool) -> list[tuple[str, str]]:
+        failures = self.info.get("failures", [])
+        return [
+            (str(item["location"]), str(item["message"]))
+            for item in failures
+            if (item["kind"] in INPUT_KINDS) is of_inputs
+        ]
 
 
 def read_run(folder: Path, again: Again | None = None) -> ComparedRun:
@@ -141,13 +156,16 @@ def without_poses(runs: Sequence[ComparedRun]) -> list[str]:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a report file, over an older one; devices such as /dev/stdout are written to.
+    """Write a report file, over an older one; ``-`` is stdout, and devices are written to.
 
     Raises
     ------
     KnownError
         The operating system refuses.
     """
+    if is_stdout(path):
+        write_stdout(content)
+        return
     try:
         path.write_bytes(content)
     except OSError as error:

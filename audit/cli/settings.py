@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.toml_file import read_toml, shown
 from sfm_audit.audit.config import AuditConfig
 
@@ -62,7 +63,9 @@ def _problem(detail: ErrorDetails, place: Callable[[str], str]) -> str:
     name = ".".join(str(part) for part in detail["loc"])[:_SHOWN]
     if detail["type"] == "extra_forbidden":
         where = place(name).removesuffix(name)
-        return f"{where}unknown setting {name}; expected one of {', '.join(AuditConfig.model_fields)}"
+        known = AuditConfig.model_fields
+        hint = did_you_mean(name, known) or f"; expected one of {', '.join(known)}"
+        return f"{where}unknown setting {name}{hint}"
     wanted = detail["msg"].removeprefix("Input should be ")
     if detail["type"] == "string_pattern_mismatch":
         wanted = _PATTERNS[name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileE
 from sfm_audit.loaders.paths.files import read_bytes
 
 _EXAMPLES = 3
+_MAX_COMPARED = 200  # characters of a name: difflib takes the product of both lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +96,11 @@ def _unknown(refs: Sequence[ModelRef], wanted: Selection) -> list[LoadError]:
         if missing:
             more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
             position = Position("line", each.names[missing[0]])
+            close = get_close_matches(missing[0], sorted(known), n=1) if len(missing[0]) <= _MAX_COMPARED else []
             got = f"{missing[0]!r}{more}, not below these PATHs"
             advice = "remove the name, or add the PATH that holds it"
+            if close:
+                advice = f"did you mean {close[0]!r}? Otherwise {advice}"
             problems.append(MissingFileError(each.path, position, "scenes of these PATHs", got, advice))
     return problems
 
@@ -107,4 +112,9 @@ def _any_fits(names: Iterable[str], glob: str) -> bool:
 def _no_match(option: str, glob: str, names: set[str]) -> LoadError:
     examples = ", ".join(sorted(names)[:_EXAMPLES])
     got = f"{len(names)} others ({examples}{', ...' if len(names) > _EXAMPLES else ''})"
-    return LoadError(f"{option} {glob!r}", None, "a name that fits", got, "see --list")
+    close = get_close_matches(glob, sorted(names), n=1) if len(glob) <= _MAX_COMPARED else []
+    return LoadError(f"{option} {glob!r}", None, "a name that fits", got, _advice(close))
+
+
+def _advice(close: Sequence[str]) -> str:
+    return f"did you mean {close[0]!r}? See --list" if close else "see --list"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Final
 
 from sfm_audit.reports.compare.comparison import Comparison, RunSnapshot, ScopeChange, ScopeNumbers, scope_numbers
@@ -210,7 +211,9 @@ def _unmatched(policy: GatePolicy, scopes: Iterable[Scope]) -> Iterator[Check]:
         candidates = [scope for scope in listed if scope.kind == kind]
         for section in getattr(policy, kind):
             if not any(section.matches(scope) for scope in candidates):
-                message = f"no {kind} is called {section.match!r}"
+                names = sorted({name for scope in candidates for name in (scope.scene, scope.name) if name})
+                close = get_close_matches(section.match, names, n=1)
+                message = f"no {kind} is called {section.match!r}{f', did you mean {close[0]!r}?' if close else ''}"
                 yield Check(Scope(), f"{kind}.match", False, None, None, message)
 
 

@@ -30,6 +30,11 @@ _ONE_IMAGE: Final = frozenset(
 )
 _COUNTS: Final = frozenset({"lost_scenes", "lost_models", "fragments"})
 _SHARES: Final = _ONE_IMAGE | {"lost_images", "camera_model_changed"}
+_WIDEST: Final = {
+    **dict.fromkeys(_SHARES, 0.5),
+    **dict.fromkeys(("median_sigma", "noise_s0", "recomputed_error"), 1.0),
+    "systematic_px": 2.0,
+}  # from here on a band says nothing: half of the images, twice the noise, eight times the default growth
 _DIGITS: Final = 1e4
 _NO_DIGITS: Final = 1e12  # larger ones are rounded as they are
 
@@ -79,6 +84,20 @@ def learn_bands(runs: Sequence[RunSnapshot], align: Aligner | None = None) -> Le
     }
     everywhere = {key: max((worst[key] for worst in largest.values()), default=0.0) for key in BAND_KEYS}
     return LearntBands(len(runs), margin, everywhere, common, scenes)
+
+
+def says_nothing(learnt: LearntBands) -> list[str]:
+    """Return a line per band that hardly any night would leave, such as 0.6 of all images newly rejected."""
+    wide = [("", key, learnt.common[key]) for key in BAND_KEYS]
+    wide += [
+        (f"scene {scope.name}: ", key, band) for scope, bands in learnt.scenes.items() for key, band in bands.items()
+    ]
+    return [
+        f"{_one_line(where)}{key} = {_number(value)} says nothing: the runs differ by more than a gate could "
+        "allow; look at them with sfm-audit diff, and learn from runs that belong together"
+        for where, key, value in wide
+        if value >= _WIDEST.get(key, math.inf)
+    ]
 
 
 def gate_toml(learnt: LearntBands, names: Sequence[str]) -> str:

@@ -19,6 +19,9 @@ RUN_JSON: Final = "run.json"
 MAX_RUN_JSON_BYTES: Final = 32_000_000  # 100,000 inputs that cannot be read
 _SHOWN: Final = 80
 
+INPUT_KINDS: Final = frozenset({"unreadable", "too_large"})
+"""Kinds of failures that lie in the input; the others are bugs and limits that stopped a model."""
+
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Key = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 _Table = Annotated[str, Field(pattern=r"^(images|cameras|models|observations)$")]

@@ -329,6 +329,8 @@ def _labels(ref: ModelRef) -> dict[str, str]:
 
 
 def _refuse_foreign_folder(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(folder, "it is a file, and a run is a folder")
     if not folder.is_dir():
         return
     for name in (*_ALL_TABLES, ERRORS):

@@ -60,9 +60,84 @@ def test_all_reports_are_written_pass_or_fail():
     assert not ET.parse("j.xml").getroot().findall(".//failure")  # noqa: S314
 
 
-def test_an_empty_gate_without_baseline_checks_nothing_and_says_so(capsys):
+@pytest.mark.parametrize("gate", ["", "band.lost_images = 0.5", 'scene = [{match = "a", band.noise_s0 = 1}]'])
+def test_a_gate_without_limits_and_baseline_is_2_and_says_what_to_write(gate, capsys):
+    Path("gate.toml").write_text(gate, encoding="utf-8")
+    assert check("RUN", "--json", "j.json") == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith("sfm-audit: gate.toml: checks nothing")
+    advice = err[err.index("limits.min_share_accepted") : err.index(" (docs/nightly.md)")]
+    Path("gate.toml").write_text(advice.replace(" and ", "\n"), encoding="utf-8")  # what it says to write works
     assert check("RUN") == 0
-    assert "nothing was checked" in capsys.readouterr().out
+    assert not Path("j.json").exists()
+
+
+def test_a_model_that_a_bug_stopped_fails_the_gate_and_is_named(capsys):
+    failures = [
+        ("data/x", "data/x: ZeroDivisionError", "error", "errors/x.txt"),
+        ("data/y", "data/y: took 9 s", "time"),
+    ]
+    write_run(Path("PART"), SOUND, failures=failures)
+    assert check("PART", "--baseline", "RUN0", "--junit", "j.xml", "--markdown", "m.md", "--json", "j.json") == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.startswith("FAILED PART against RUN0: 2 of 38 checks failed")
+    assert "run.stopped: data/x: ZeroDivisionError; tracebacks of bugs are in PART/errors" in out
+    content = json.loads(Path("j.json").read_bytes())
+    assert content["unread"] == []
+    assert [check["check"] for check in content["checks"] if not check["passed"]] == ["run.stopped"] * 2
+    assert len(ET.parse("j.xml").getroot().findall(".//failure")) == 2  # noqa: S314
+    assert "data/y: took 9 s" in Path("m.md").read_text(encoding="utf-8").replace("\\", "")
+    assert check("RUN0", "--baseline", "PART") == 0
+    assert "2 inputs of the baseline could not be read or audited" in " ".join(capsys.readouterr().out.split())
+    assert main(["learn-band", "PART", "RUN0"]) == 3
+    assert "PART: has inputs that could not be read or audited (data/x)" in capsys.readouterr().err
+
+
+def test_an_input_that_is_missing_comes_before_a_bug():
+    write_run(Path("PART"), SOUND, failures=[("x", "x: a bug", "error"), ("y", "y: no such file")])
+    assert check("PART", "--baseline", "RUN0") == 3
+
+
+@pytest.mark.parametrize("option", ["--junit", "--markdown", "--json"])
+def test_a_report_to_stdout_has_it_for_itself(option, capsys):
+    assert check("RUN", "--baseline", "RUN0", option, "file") == 1
+    page = capsys.readouterr().out
+    assert check("RUN", "--baseline", "RUN0", option, "-") == 1
+    out, err = capsys.readouterr()
+    assert err == page
+    assert out.splitlines()[-1] == Path("file").read_text(encoding="utf-8").splitlines()[-1]
+    assert not Path("-").exists()
+
+
+def test_two_reports_do_not_share_stdout(capsys):
+    assert check("RUN", "--baseline", "RUN0", "--json", "-", "--markdown", "-") == 2
+    assert "Only one output can be -" in capsys.readouterr().err
+
+
+def test_a_section_that_fits_nothing_says_what_was_probably_meant(capsys):
+    Path("gate.toml").write_text('scene = [{match = "data/A", limits.min_images = 1}]', encoding="utf-8")
+    assert check("RUN") == 1
+    assert "no scene is called 'data/A', did you mean 'data/a'?" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_band_that_says_nothing_and_runs_of_other_photos_are_said(capsys):
+    write_run(Path("BAD"), {"a": rejected(scene(40), *range(10)), "b": scene(40)})
+    assert main(["learn-band", "RUN0", "BAD", "RUN0", "-o", "-"]) == 0
+    out, err = capsys.readouterr()
+    said = [line for line in err.splitlines() if "says nothing" in line]
+    assert [line.split("sfm-audit: ")[1].split(" says")[0] for line in said] == [
+        "scene data/a: newly_rejected = 0.75",
+        "scene data/a: share_accepted = 0.75",
+        "scene data/a: share_rejected = 0.75",
+        "scene data/a: share_rejected_by_reason = 0.75",
+    ]
+    assert "newly_rejected = 0.375" in out
+    write_run(Path("OTHER"), {"a": scene(image_name=[f"IMG_{i:04d}.jpg" for i in range(35, 75)])})
+    assert main(["learn-band", "RUN0", "OTHER", "RUN0"]) == 0
+    assert "OTHER and RUN0 share 5 of their 115 images" in capsys.readouterr().err
+    assert main(["learn-band", "RUN0", "RUN0", "RUN0"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_absolute_limits_need_no_baseline(capsys):
@@ -152,7 +227,7 @@ def test_a_report_that_cannot_be_written_is_4(option, capsys):
 
 
 def test_other_reports_are_written_when_one_cannot_be():
-    assert check("RUN0", "--junit", "no/such/folder", "--json", "j.json") == 4
+    assert check("RUN0", "--baseline", "RUN0", "--junit", "no/such/folder", "--json", "j.json") == 4
     assert Path("j.json").exists()
 
 

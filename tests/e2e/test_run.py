@@ -210,6 +210,7 @@ def test_output_that_cannot_be_written_is_4(out, capsys):
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert "cannot be written" in captured.err
+    assert ("it is a file, and a run is a folder" in captured.err) == (out == "file")
 
 
 def test_a_disk_that_fills_up_is_4_and_finished_parts_stay():

@@ -102,7 +102,8 @@ def test_the_extra_for_tests_is_added_to_the_same_environment(checkout):
     assert checkout.stamps() == [".installed-base"]
     assert checkout.run("dev").stderr == "Updating .venv ...\n"
     assert checkout.log() == ["venv", ".", ".[dev]"]
-    assert checkout.stamps() == [".installed-base", ".installed-dev"]
+    extras = ["base", "calibrate", "cluster", "dev", "report"]
+    assert checkout.stamps() == [f".installed-{extra}" for extra in extras]
 
 
 def test_a_changed_pyproject_is_installed_again_without_a_rebuild(checkout):
@@ -219,3 +220,36 @@ def test_the_users_python_path_stays_outside(checkout):
     checkout.run("base")
     executable(checkout.root / ".venv" / "bin" / "tool", '#!/bin/sh\necho "${PYTHONPATH-unset} ${PYTHONHOME-unset}"\n')
     assert checkout.run("base", "tool", PYTHONPATH="/opt/ros", PYTHONHOME="/opt").stdout == "unset unset\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (["report", "RUN"], "report"),
+        (["explain", "--help"], "report"),
+        (["calibrate", "run"], "calibrate"),
+        (["simulate", "board"], "calibrate"),
+        (["run", "report", "-o", "RUN"], "base"),
+        (["run", "PATH", "--dask", "local"], "cluster"),
+        (["run", "PATH", "--dask=local"], "cluster"),
+        (["--version"], "base"),
+        ([], "base"),
+    ],
+)
+def test_the_command_line_installs_the_extra_that_its_verb_needs_and_says_so(checkout, words, extra):
+    checkout.run("base")
+    executable(checkout.root / ".venv" / "bin" / "sfm-audit", '#!/bin/sh\necho "verb $*"\n')
+    checkout.log()
+    done = checkout.run(*words, script="sfm-audit")
+    said = f"Installing what this needs into .venv (extra {extra}, first use) ...\n"
+    assert (done.stdout, done.stderr) == (f"verb {' '.join(words)}\n", "" if extra == "base" else said)
+    assert checkout.log() == ([] if extra == "base" else [f".[{extra}]"])
+    assert checkout.run(*words, script="sfm-audit").stderr == ""
+
+
+def test_the_extra_for_tests_holds_all_others(checkout):
+    checkout.run("dev")
+    executable(checkout.root / ".venv" / "bin" / "sfm-audit", "#!/bin/sh\n")
+    checkout.log()
+    assert checkout.run("report", "RUN", script="sfm-audit").stderr == ""
+    assert checkout.log() == []

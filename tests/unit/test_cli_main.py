@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 import pytest
 
-from sfm_audit.audit.cli import auditing, main
+from sfm_audit.audit.cli import main, terminal
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 
 
@@ -101,13 +101,22 @@ def test_an_unknown_error_keeps_its_traceback(raising):
 
 
 def test_output_that_the_terminal_cannot_show_is_shown_by_code():
-    code = "from sfm_audit.audit.cli.auditing import print_page; print_page('Zürich 東')"
+    code = "from sfm_audit.audit.cli.terminal import print_page; print_page('Zürich 東')"
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
     assert done.stdout == "Z\\xfcrich \\u6771\n"
 
 
-def test_the_page_is_80_columns_wide_where_there_is_no_terminal(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "40")
-    assert auditing.terminal_page().width == 80
-    assert not auditing.terminal_page().colour
+@pytest.mark.parametrize(
+    ("columns", "width"),
+    [("132", 132), ("40", 40), ("10", 40), ("", 80), ("wide", 80), ("-5", 80), ("0", 40), ("1" * 5000, 80), ("²", 80)],
+)
+def test_without_a_terminal_columns_says_how_wide_the_page_is(columns, width, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert terminal.terminal_page().width == width
+
+
+def test_the_page_is_80_columns_wide_where_nothing_says_otherwise(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert terminal.terminal_page().width == 80
+    assert not terminal.terminal_page().colour

@@ -9,8 +9,9 @@ from sfm_audit.audit.cli.gate_file import read_gate_file
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("limit = 1", "unknown key limit; expected one of limits, band, dataset, scene"),
-        ("limits.min_share = 1", "unknown key limits.min_share; expected one of min_images"),
+        ("limit = 1", "unknown key limit, did you mean limits?"),
+        ("limits.min_share = 1", "unknown key limits.min_share, did you mean min_share_accepted?"),
+        ("width = 1", "unknown key width; expected one of limits, band, dataset, scene"),
         ('[[scene]]\nmatch = "a"\n[[scene]]\nmatch = "b"\nlimits.x = 1', "unknown key scene[2].limits.x"),
         ("[[scene]]\nlimits.min_images = 1", "scene[1].match is missing"),
         ("limits.min_share_accepted = 1.5", "limits.min_share_accepted: expected less than or equal to 1, found 1.5"),
@@ -21,6 +22,7 @@ from sfm_audit.audit.cli.gate_file import read_gate_file
         ("band.median_sigma = -0.1", "band.median_sigma: expected greater than or equal to 0, found -0.1"),
         ("band.median_sigma = nan", "band.median_sigma"),
         ("limits.max_share_rejected_by_reason = {ks = 0.1}", "unknown reason ks; docs/verdicts.md lists them"),
+        ("limits.max_share_rejected_by_reason = {misfit_radail = 0.1}", "misfit_radail, did you mean misfit_radial?"),
         ("limits.max_share_rejected_by_reason.ks_rejected = 2", "limits.max_share_rejected_by_reason.ks_rejected"),
         ("limits.max_lost_images = 0", "limits.max_lost_images needs --baseline RUN0"),
         ('[[scene]]\nmatch = "a"\nlimits.max_lost_images = 0', "scene 'a': limits.max_lost_images needs --baseline"),
