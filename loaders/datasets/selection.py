@@ -14,6 +14,7 @@ from sfm_audit.loaders.paths.files import read_bytes
 
 _EXAMPLES = 3
 _MAX_COMPARED = 200  # characters of a name: difflib takes the product of both lengths
+_MAX_NAMES = 2_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +97,11 @@ def _unknown(refs: Sequence[ModelRef], wanted: Selection) -> list[LoadError]:
         if missing:
             more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
             position = Position("line", each.names[missing[0]])
-            close = get_close_matches(missing[0], sorted(known), n=1) if len(missing[0]) <= _MAX_COMPARED else []
+            close = _closest(missing[0], known)
             got = f"{missing[0]!r}{more}, not below these PATHs"
             advice = "remove the name, or add the PATH that holds it"
             if close:
-                advice = f"did you mean {close[0]!r}? Otherwise {advice}"
+                advice = f"did you mean {close!r}? Otherwise {advice}"
             problems.append(MissingFileError(each.path, position, "scenes of these PATHs", got, advice))
     return problems
 
@@ -112,9 +113,15 @@ def _any_fits(names: Iterable[str], glob: str) -> bool:
 def _no_match(option: str, glob: str, names: set[str]) -> LoadError:
     examples = ", ".join(sorted(names)[:_EXAMPLES])
     got = f"{len(names)} others ({examples}{', ...' if len(names) > _EXAMPLES else ''})"
-    close = get_close_matches(glob, sorted(names), n=1) if len(glob) <= _MAX_COMPARED else []
-    return LoadError(f"{option} {glob!r}", None, "a name that fits", got, _advice(close))
+    close = _closest(glob, names)
+    advice = f"did you mean {close!r}? See --list" if close else "see --list"
+    return LoadError(f"{option} {glob!r}", None, "a name that fits", got, advice)
 
 
-def _advice(close: Sequence[str]) -> str:
-    return f"did you mean {close[0]!r}? See --list" if close else "see --list"
+def _closest(word: str, names: Iterable[str]) -> str | None:
+    """Return the name that was probably meant."""
+    if len(word) > _MAX_COMPARED:
+        return None
+    known = sorted(names)[:_MAX_NAMES]
+    same = [name for name in known if name.casefold() == word.casefold()]
+    return next(iter(same or get_close_matches(word, known, n=1)), None)

