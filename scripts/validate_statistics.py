@@ -31,7 +31,8 @@ def _said(page: str, share: float) -> str:
         f"Made with `--share {share:g}`: that part of the full study's images where sizes and powers are measured,\n"
         "all of its scenes with a quarter of the images wrong, with moved poses and with frozen parameters."
     )
-    return page.replace("# Validation\n", f"# Validation\n\n{said}\n", 1)
+    title, _, rest = page.partition("\n")
+    return f"{title}\n\n{said}\n{rest}"
 
 
 def main() -> int:
@@ -59,9 +60,8 @@ def main() -> int:
     print(f"{len(checks)} bounds, {violated} violated")
     if not args.quick:
         args.docs.mkdir(parents=True, exist_ok=True)
-        (args.docs / "validation.md").write_text(
-            _said(document(tables, checks, args.seed), args.share), encoding="utf-8"
-        )
+        for name, page in document(tables, checks, args.seed).items():
+            (args.docs / name).write_text(_said(page, args.share), encoding="utf-8")
         draw_figures(tables, args.docs / "figures")
     return 1 if violated else 0
 

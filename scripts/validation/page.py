@@ -21,25 +21,32 @@ from sfm_audit.audit.simulate.defects import DefectKind
 POWER_CLASSES: Final = ((0.03, 0.1), (0.1, 0.2), (0.2, 0.3), (0.3, 0.5), (0.5, 1.2))
 
 
-def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> str:
-    """Return the whole page."""
-    sections = [
+def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> dict[str, str]:
+    """Return the pages by file name: what a reader needs, and the tables behind it."""
+    page = [
         words.INTRO.format(seed=seed, holds=HOLDS, chance=WITHIN_CHANCE, violated=VIOLATED.lower()),
         _claims(checks),
         _setup(tables["scenes"]),
-        _single_size(tables["singles"]),
-        _scene_size(tables["scenes"]),
-        _power(tables["power"], tables["exact"]),
+        words.FIGURES,
         faults.blame_section(tables["scenes"]),
-        faults.frozen_section(tables["frozen"]),
-        faults.focal_sd_section(tables["scenes"]),
         _poses(tables["scenes"]),
         _cameras(tables["cameras"]),
         _advice(tables["advice"]),
         _rules(tables["scenes"]),
         words.LIMITS,
     ]
-    return "\n\n".join(sections) + "\n"
+    details = [
+        words.DETAILS.format(seed=seed),
+        _single_size(tables["singles"]),
+        _scene_size(tables["scenes"]),
+        _power(tables["power"], tables["exact"]),
+        faults.frozen_section(tables["frozen"]),
+        faults.focal_sd_section(tables["scenes"]),
+    ]
+    return {
+        "validation.md": "\n\n".join(page) + "\n",
+        "validation_details.md": "\n\n".join(details) + "\n",
+    }
 
 
 def _claims(checks: Sequence[Check | Within]) -> str:

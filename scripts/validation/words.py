@@ -20,6 +20,24 @@ share on the bound gives such a count less than one time in a thousand (binomial
 counted as outside **{chance}**. Images of one scene share points, so their counts vary somewhat more than the binomial
 says. A bound of 0 or 100 % leaves nothing to chance."""
 
+FIGURES: Final = """\
+## Sizes and powers in two figures
+
+Correct cameras: how often each test of the misfit groups rejects at 5 %, against the number of points (log scale), and
+wrong ones: how often they are found, against how wrong they are. The tables behind both, by noise and number of points,
+with parameters that were never freed and how well a focal length is known:
+[validation_details.md](validation_details.md).
+
+![Size of the misfit groups against n](figures/validation_size.svg)
+
+![Power against the size of the defect](figures/validation_power.svg)"""
+
+DETAILS: Final = """\
+# Validation: sizes and powers
+
+Made by `scripts/validate_statistics.py`; do not edit. Seed {seed}. The tables behind
+[validation.md](validation.md), which says what is simulated and what holds."""
+
 SETUP: Final = """\
 ## What is simulated
 
