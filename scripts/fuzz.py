@@ -27,11 +27,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from scripts.fuzzing.cases import Case, write_case
-from scripts.fuzzing.targets import TARGETS, Outcome
+from scripts.fuzzing.cases import Case
+from scripts.fuzzing.outcomes import Outcome
+from scripts.fuzzing.targets import TARGETS, write_input
 from scripts.fuzzing.workers import Worker
 
-_PYCOLMAP_SECONDS = 5.0  # where it takes longer, it hangs
+_PYCOLMAP_MEMORY_BYTES = 64 << 20  # it takes what a file claims
+_PYCOLMAP_SECONDS = 5.0
 _MAX_SAME = 3  # failures at one place that are made small and written
 
 
@@ -46,9 +48,10 @@ class Failure:
 
 @dataclass(slots=True)
 class Campaign:
-    """What happened so far. beside: outcome here and of pycolmap -> number."""
+    """What happened so far. kinds: target and kind of input -> outcomes; beside: outcome here and of pycolmap."""
 
     outcomes: dict[str, Counter[str]] = field(default_factory=lambda: {name: Counter() for name in TARGETS})
+    kinds: dict[str, Counter[str]] = field(default_factory=dict)
     places: Counter[str] = field(default_factory=Counter)
     beside: Counter[str] = field(default_factory=Counter)
     silent: list[dict[str, Any]] = field(default_factory=list)
@@ -60,7 +63,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run a campaign and write its record; return 1 where something failed."""
     options = _options(args)
     targets = options.target or list(TARGETS)
-    numbers = iter([options.only]) if options.only is not None else count(options.first)
+    numbers = iter([options.only]) if options.only is not None else _numbers(options.first, options.inputs)
     campaign, start = Campaign(), time.monotonic()
     end = start + 60 * options.minutes
     threads = [
@@ -77,11 +80,16 @@ def main(args: Sequence[str] | None = None) -> int:
     return int(bool(campaign.failures) or bool(campaign.silent))
 
 
+def _numbers(first: int, num: int | None) -> Iterator[int]:
+    return iter(range(first, first + num)) if num is not None else count(first)
+
+
 def _options(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first input")
+    parser.add_argument("--inputs", type=int, help="end after so many, if --minutes are not over before")
     parser.add_argument("--only", type=int, help="try this input alone")
     parser.add_argument("--target", action="append", choices=list(TARGETS), help="repeatable; default: all in turn")
     parser.add_argument("--jobs", type=int, default=1)
@@ -96,7 +104,8 @@ def _work(
     options: argparse.Namespace, targets: Sequence[str], numbers: Iterator[int], campaign: Campaign, end: float
 ) -> None:
     limits = {"memory_bytes": options.memory_mb << 20, "seconds": options.seconds}
-    worker, theirs = Worker(**limits), Worker(**{**limits, "seconds": _PYCOLMAP_SECONDS}, with_pycolmap=True)
+    worker = Worker(**limits)
+    theirs = Worker(memory_bytes=_PYCOLMAP_MEMORY_BYTES, seconds=_PYCOLMAP_SECONDS, with_pycolmap=True)
     try:
         while time.monotonic() < end or options.only is not None:
             with campaign.lock:
@@ -118,6 +127,7 @@ def _try(
     outcome = workers[0].attempt(name, case)
     with campaign.lock:
         campaign.outcomes[name][outcome.kind] += 1
+        campaign.kinds.setdefault(f"{name}: {case.kind}", Counter())[outcome.kind] += 1
     if target.with_pycolmap:
         _compare(campaign, case, outcome, workers[1].attempt(name, case))
     if outcome.is_good:
@@ -158,7 +168,7 @@ def _smallest(worker: Worker, name: str, case: Case, outcome: Outcome) -> Case:
 def _write(failures: Path, name: str, case: Case, outcome: Outcome) -> None:
     folder = failures / f"{name}-{case.base}-{case.number}-{outcome.kind}"
     folder.mkdir(parents=True, exist_ok=True)
-    write_case(case, folder)
+    write_input(case, folder)
     text = json.dumps({**_as_json(case), **asdict(outcome)}, indent=1)
     (folder / "what.json").write_text(text + "\n", encoding="utf-8")
 
@@ -184,6 +194,7 @@ def _record(options: argparse.Namespace, campaign: Campaign, seconds: float) -> 
         "versions": {"python": platform.python_version(), "numpy": np.__version__, "pycolmap": pycolmap.__version__},
         "limits": {"seconds": options.seconds, "memory_mb": options.memory_mb, "cores": os.cpu_count()},
         "outcomes": {name: dict(counts.most_common()) for name, counts in campaign.outcomes.items() if counts},
+        "kinds": {kind: dict(counts.most_common()) for kind, counts in sorted(campaign.kinds.items())},
         "beside_pycolmap": dict(campaign.beside.most_common()),
         "silent": campaign.silent,
         "places": dict(campaign.places.most_common()),

@@ -44,14 +44,14 @@ def read_correspondences(
         is not one of the scan, or has no neighbour there; the file states ``rows=N`` and holds another number. The
         message names the line (CSV) or row (Parquet, from 1).
     """
-    table = read_number_table(parse_location(location), (*IMAGE, *WORLD, *PAN, *TILT), IGNORED)
+    table = read_number_table(parse_location(location), (IMAGE, WORLD, PAN, TILT), IGNORED)
     has_neighbours = _check_columns(table)
     _check_rows(table)
     size = _side(table, "width", width), _side(table, "height", height)
-    xy_px, xyz_world = _stack(table, IMAGE), _stack(table, WORLD)
+    xy_px, xyz_world = table.groups[IMAGE], table.groups[WORLD]
     _check_inside(table, xy_px, size)
-    pan = _stack(table, PAN) if has_neighbours else None
-    tilt = _stack(table, TILT) if has_neighbours else None
+    pan = table.groups[PAN] if has_neighbours else None
+    tilt = table.groups[TILT] if has_neighbours else None
     if scan is not None:
         if has_neighbours:
             got = f"columns {', '.join((*PAN, *TILT))} and a scan"
@@ -64,10 +64,6 @@ def read_correspondences(
             distance = np.linalg.norm(neighbour - xyz_world, axis=1)
             _refuse(table, distance == 0.0, wanted, WORLD, "name the next point of the scan")
     return Correspondences(*size, xy_px, xyz_world, pan, tilt)
-
-
-def _stack(table: NumberTable, names: tuple[str, ...]) -> FloatArray:
-    return np.column_stack([table.columns[name] for name in names])
 
 
 def _check_columns(table: NumberTable) -> bool:

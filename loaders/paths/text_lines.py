@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -19,6 +19,7 @@ _STATED_COUNT: Final = re.compile(rb"#\s*Number of (?:cameras|images|points|rigs
 POINTS: Final = "3D points"
 _BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
 _PIECE_BYTES: Final = 1 << 25
+_MAX_LINE: Final = 1 << 20  # bytes, where a file is read line by line
 _ADVICE: Final = "check that this is COLMAP's text format, or export the reconstruction again"
 _RECOPY: Final = "copy or export the reconstruction again"
 
@@ -50,6 +51,55 @@ class TextFile:
     def truncated(self, wanted: str, got: str) -> TruncatedFileError:
         """Return the error for a file that ends too early."""
         return TruncatedFileError(str(self.path), Position("line", len(self.lines)), wanted, got, _RECOPY)
+
+
+class TextStream:
+    """The lines of one file, one after the other, for a ``with`` block; a piece of the file is in memory.
+
+    num_bytes: of the file.    num_lines: read so far.    is_terminated: whether the last line that was read has an end.
+    """
+
+    def __init__(self, path: InputPath, advice: str = _ADVICE) -> None:
+        self.path = path
+        self.num_lines = 0
+        self.is_terminated = True
+        self._advice = advice
+        self._file, self.num_bytes = open_input(path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def records(self) -> Iterator[tuple[int, bytes]]:
+        """Yield line numbers (from 1) and lines that are not blank, comments included, without surrounding blanks.
+
+        Raises
+        ------
+        MalformedFileError
+            A line holds a NUL byte, or is longer than 1 MiB.
+        """
+        with reading(self.path):
+            while line := self._file.readline(_MAX_LINE + 1):
+                self.num_lines += 1
+                if self.num_lines == 1:
+                    line = line.removeprefix(_BYTE_ORDER_MARK)
+                if b"\0" in line:
+                    raise self.malformed(self.num_lines, "text", "a NUL byte")
+                if len(line) > _MAX_LINE:
+                    raise self.malformed(self.num_lines, f"lines of at most {_MAX_LINE} bytes", "a longer one")
+                self.is_terminated = line.endswith(b"\n")
+                if stripped := line.strip():
+                    yield self.num_lines, stripped
+
+    def malformed(self, line: int, wanted: str, got: str) -> MalformedFileError:
+        """Return the error for a line that is not what it should be."""
+        return MalformedFileError(str(self.path), Position("line", line), wanted, got, self._advice)
+
+    def truncated(self, wanted: str, got: str) -> TruncatedFileError:
+        """Return the error for a file that ends too early."""
+        return TruncatedFileError(str(self.path), Position("line", self.num_lines), wanted, got, _RECOPY)
 
 
 def read_text(path: InputPath, advice: str = _ADVICE, *, may_be_empty: bool = False) -> TextFile:

@@ -7,7 +7,6 @@ Both may hold pickled objects, so nothing here is read by numpy's or Python's ow
 
 from __future__ import annotations
 
-import io
 import re
 import struct
 import zipfile
@@ -15,13 +14,13 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, BinaryIO, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from sfm_audit.loaders.errors import MalformedFileError
-from sfm_audit.loaders.paths.files import read_bytes
+from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.scene_info.inert_pickle import (
     NEW_CORE,
     OLD_CORE,
@@ -87,13 +86,13 @@ def read_scene_info(path: str | Path) -> SceneInfo:
     LoadError
         The file cannot be read, is not a scene_info file, or asks for code to be run; the message names that code.
     """
-    file = Path(path)
-    data = read_bytes(file)
+    file, num_bytes = open_input(Path(path))
     try:
-        if data.startswith(_ZIP_MAGIC):
-            members, values = _read_npz(data)
-            return _scene_info("npz", values, members=members)
-        inert = load_inert(data)
+        with file, reading(Path(path)):
+            if file.peek(len(_ZIP_MAGIC)).startswith(_ZIP_MAGIC):
+                members, values = _read_npz(file, num_bytes)
+                return _scene_info("npz", values, members=members)
+            inert = load_inert(file.read())
         return _scene_info("pickle", inert.value, protocol=inert.protocol, numpy_core=inert.numpy_core)
     except RefusedPickleError as error:
         wanted = "a scene_info file of numpy arrays and builtin containers"
@@ -169,7 +168,7 @@ def _pairs(pair_infos: Any, num_images: int) -> npt.NDArray[np.int64]:
     return out
 
 
-def _read_npz(data: bytes) -> tuple[dict[str, NpzMember], dict[str, Any]]:
+def _read_npz(file: BinaryIO, num_bytes: int) -> tuple[dict[str, NpzMember], dict[str, Any]]:
     """Return the members of a .npz, and the values of those that say which images and pairs there are.
 
     Every member with objects is read, so that none is copied that would run code in the programs that load it.
@@ -177,13 +176,11 @@ def _read_npz(data: bytes) -> tuple[dict[str, NpzMember], dict[str, Any]]:
     members: dict[str, NpzMember] = {}
     values: dict[str, Any] = {}
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            expanded, most = (
-                sum(entry.file_size for entry in archive.infolist()),
-                _EXPANSION[0] + _EXPANSION[1] * len(data),
-            )
+        with zipfile.ZipFile(file) as archive:
+            expanded = sum(entry.file_size for entry in archive.infolist())
+            most = _EXPANSION[0] + _EXPANSION[1] * num_bytes
             if expanded > most:
-                raise RefusedPickleError(f"an archive of {len(data)} bytes that holds {expanded}, more than {most}")
+                raise RefusedPickleError(f"an archive of {num_bytes} bytes that holds {expanded}, more than {most}")
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(_SUFFIX)
                 if name in members or not entry.filename.endswith(_SUFFIX):
@@ -203,10 +200,9 @@ def _read_npz(data: bytes) -> tuple[dict[str, NpzMember], dict[str, Any]]:
 def _read_npy(content: bytes) -> tuple[Array, InertPickle | None]:
     """Return the array of a .npy file, and how its pickle was written where it holds objects."""
     shape, order, dtype, start = _npy_header(content)
-    rest = content[start:]
     if not dtype.hasobject:
-        return array_from_bytes(rest, dtype, shape, order), None
-    inert = load_inert(rest)
+        return array_from_bytes(memoryview(content)[start:], dtype, shape, order), None
+    inert = load_inert(content[start:])
     array = inert.value
     if not isinstance(array, np.ndarray) or array.dtype != object or array.shape != shape:
         raise RefusedPickleError("an array of objects that is none, or has another shape than its header says")

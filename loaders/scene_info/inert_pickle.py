@@ -59,7 +59,10 @@ def load_inert(data: bytes) -> InertPickle:
     check_opcodes(data)
     unpickler = _Unpickler(io.BytesIO(data))
     try:
-        value = _Resolver(len(data)).resolve(unpickler.load())
+        loaded = unpickler.load()
+        core = unpickler.numpy_core or OLD_CORE
+        del unpickler  # with its memo, which holds every object
+        value = _Resolver(len(data)).resolve(loaded)
     except RefusedPickleError:
         raise
     except (
@@ -77,7 +80,7 @@ def load_inert(data: bytes) -> InertPickle:
     ) as error:  # the kinds that Python's documentation names for damaged pickles
         raise RefusedPickleError(f"a damaged pickle ({' '.join(str(error).split())[:120]})") from error
     protocol = data[1] if data[:1] == pickle.PROTO else 0
-    return InertPickle(value, protocol, unpickler.numpy_core or OLD_CORE)
+    return InertPickle(value, protocol, core)
 
 
 @dataclass(slots=True, eq=False)
@@ -92,6 +95,10 @@ class _Note:
         if self.state is not None or self.call not in {"_reconstruct", "dtype"}:
             raise RefusedPickleError(f"a pickle that sets the state of numpy's {self.call} where no array needs it")
         self.state = state
+
+    def forget(self) -> None:
+        """Let go of what was recorded, once the object that it describes is made: it would be in memory twice."""
+        self.args, self.state = (), None
 
 
 class _Global:
@@ -195,8 +202,10 @@ class _Resolver:
         if kind is dict:
             return {self.resolve(key, depth): self.resolve(item, depth) for key, item in value.items()}
         if kind is _Note:
-            made: Callable[[_Note, int], Any] = getattr(self, f"_{value.call.lstrip('_')}")
-            return made(value, depth)
+            make: Callable[[_Note, int], Any] = getattr(self, f"_{value.call.lstrip('_')}")
+            made = make(value, depth)
+            value.forget()
+            return made
         raise RefusedPickleError("a pickle that stores a function instead of calling it")
 
     def _reconstruct(self, note: _Note, depth: int) -> Array:
@@ -300,7 +309,7 @@ def num_items(shape: Any) -> int:
 
 def array_from_bytes(content: Any, dtype: np.dtype[Any], shape: Any, order: str) -> Array:
     """Return a writable array of a type without objects; RefusedPickleError where content, type and shape disagree."""
-    if dtype.hasobject or dtype.itemsize == 0 or type(content) not in {bytes, bytearray}:
+    if dtype.hasobject or dtype.itemsize == 0 or type(content) not in {bytes, bytearray, memoryview}:
         raise RefusedPickleError("an array whose content does not fit its type")
     if num_items(shape) * dtype.itemsize != len(content):
         raise RefusedPickleError(f"an array of {num_items(shape)} elements with {len(content)} bytes of content")
@@ -308,5 +317,5 @@ def array_from_bytes(content: Any, dtype: np.dtype[Any], shape: Any, order: str)
         codes = np.frombuffer(content, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
         if codes.max() > 0x10FFFF:
             raise RefusedPickleError("an array of text with codes that are no characters")
-    flat = np.frombuffer(bytes(content), dtype=dtype).copy()
+    flat = np.frombuffer(content, dtype=dtype).copy()
     return flat.reshape(shape, order="F" if order == "F" else "C")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+from array import array
 from collections.abc import Callable
 from typing import Final
 
@@ -18,6 +19,7 @@ class RefusedPickleError(Exception):
 
 
 _MAX_HASH: Final = 1000  # steps, and levels, of one key
+_NO_ENTRY: Final = 2**16 - 1
 _MAX_LINE: Final = 4096  # bytes of a number or a name in the text opcodes
 _MAX_INTEGER: Final = 64  # bytes
 _MAX_KEY_DIGITS: Final = 23  # of such an integer, with its sign and an L
@@ -100,7 +102,8 @@ class _Walk:
         self._at = 0
         self._stack: list[int] = []
         self._below: list[list[int]] = []
-        self._memo: dict[int, int] = {}
+        self._memo = array("H")  # costs of hashing, at most _MAX_HASH + 1; _NO_ENTRY where there is none
+        self._num_memo = 0
         self._num_bytes = 0
         self._num_hashes = 0
         self._num_ops = 0
@@ -149,13 +152,13 @@ class _Walk:
             pickle.SETITEMS: lambda: self._hash(self._since_mark()[::2]),
             pickle.ADDITEMS: lambda: self._hash(self._since_mark()),
             pickle.FROZENSET: self._frozenset,
-            pickle.GET: lambda: self._push(self._memo[self._number()]),
-            pickle.BINGET: lambda: self._push(self._memo[self._unpack("<B")]),
-            pickle.LONG_BINGET: lambda: self._push(self._memo[self._unpack("<I")]),
+            pickle.GET: lambda: self._get(self._number()),
+            pickle.BINGET: lambda: self._get(self._unpack("<B")),
+            pickle.LONG_BINGET: lambda: self._get(self._unpack("<I")),
             pickle.PUT: lambda: self._put(self._number()),
             pickle.BINPUT: lambda: self._put(self._unpack("<B")),
             pickle.LONG_BINPUT: lambda: self._put(self._unpack("<I")),
-            pickle.MEMOIZE: lambda: self._put(len(self._memo)),
+            pickle.MEMOIZE: lambda: self._put(self._num_memo),
         }
         for op, num in _FIXED.items():
             steps[op] = lambda num=num: self._leaf(num)  # type: ignore[misc]
@@ -284,8 +287,18 @@ class _Walk:
         if self._num_hashes > self._max_hashes:
             raise RefusedPickleError("a pickle whose keys are too large for its size")
 
+    def _get(self, index: int) -> None:
+        cost = self._memo[index] if index >= 0 else _NO_ENTRY
+        if cost == _NO_ENTRY:
+            raise KeyError(index)
+        self._push(cost)
+
     def _put(self, index: int) -> None:
         if not 0 <= index <= self._num_ops:
             raise RefusedPickleError(f"a damaged pickle (memo entry {index} after {self._num_ops} opcodes)")
-        self._memo[index] = self._stack[-1]
+        memo = self._memo
+        if index >= len(memo):
+            memo.extend(array("H", [_NO_ENTRY]) * (index + 1 - len(memo)))
+        self._num_memo += memo[index] == _NO_ENTRY
+        memo[index] = self._stack[-1]
         self._num_bytes += 16

@@ -57,6 +57,15 @@ class Case:
         """Whether the input is a model folder."""
         return self.base in MODELS
 
+    @property
+    def kind(self) -> str:
+        """What kind of input it is: the format, and for models what was changed."""
+        if not self.is_model:
+            return self.base
+        whats = {edit.what for edit in self.edits}
+        changed = "fields" if "field" in whats else "tokens" if "token" in whats else "bytes"
+        return f"{self.layout}, {changed}"
+
     def but(self, edits: tuple[Edit, ...]) -> Case:
         """Return the same with other edits."""
         return replace(self, edits=edits)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import io
-import re
 import shutil
 import tempfile
-import traceback
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,22 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from scripts.fuzzing.cases import FILES, PLACE, Case, file_case, model_case, write_case
-
-GOOD: Final = frozenset({"ok", "finding", "refused"})
-_MAX_STDERR_LINES: Final = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What came of an input. kind: of `GOOD`, or TRACEBACK, WARNING, NONFINITE, EXITCODE, NOISE; where: one line."""
-
-    kind: str
-    where: str = ""
-
-    @property
-    def is_good(self) -> bool:
-        """Whether that is right."""
-        return self.kind in GOOD
+from scripts.fuzzing.outcomes import Outcome, caught
+from scripts.fuzzing.run_folders import BASES, read_run_folder, run_folder_case, write_run_folder
+from scripts.fuzzing.verbs import call_verb
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,34 +26,6 @@ class Target:
     with_pycolmap: bool = False
 
 
-def place_of(error: BaseException) -> str:
-    """Return type, message and the last places of this project in a traceback, innermost first."""
-    frames = traceback.extract_tb(error.__traceback__)
-    ours = [frame for frame in frames if "sfm_audit" in frame.filename or "/audit/" in frame.filename]
-    places = [f"{_short(frame.filename)}:{frame.lineno}" for frame in reversed(ours[-4:] or frames[-2:])]
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:100]} @ {' < '.join(places)}"
-
-
-def _short(filename: str) -> str:
-    return re.sub(r".*/(?=(?:loaders|audit|reports)/)", "", filename)
-
-
-@contextmanager
-def _caught(outcomes: list[Outcome]) -> Iterator[list[warnings.WarningMessage]]:
-    """Turn any exception and warning into an outcome: that none escapes is what is tested."""
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        try:
-            yield seen
-        except Exception as error:  # noqa: BLE001 - see above
-            outcomes.append(Outcome("TRACEBACK", place_of(error)))
-    if seen and not outcomes:
-        first = seen[0]
-        outcomes.append(
-            Outcome("WARNING", f"{first.category.__name__}: {first.message} @ {_short(first.filename)}:{first.lineno}")
-        )
-
-
 def read_model(case: Case, folder: Path) -> Outcome:
     """Open the model: a model, with or without findings, or a LoadError of one line."""
     from sfm_audit.loaders import LoadError, open_model  # noqa: PLC0415 - in the worker only
@@ -80,7 +34,7 @@ def read_model(case: Case, folder: Path) -> Outcome:
     del case
     outcomes: list[Outcome] = []
     found = Outcome("ok")
-    with _caught(outcomes):
+    with caught(outcomes):
         try:
             model = open_model(folder)
             for row in range(len(model.images)):
@@ -109,7 +63,7 @@ def read_file(case: Case, folder: Path) -> Outcome:
     from sfm_audit.loaders import LoadError  # noqa: PLC0415 - in the worker only
 
     path, outcomes, found = folder / case.base, list[Outcome](), Outcome("ok")
-    with _caught(outcomes):
+    with caught(outcomes):
         try:
             values = _READERS[case.base](path)
             if values is not None and np.isinf(values).any():
@@ -165,54 +119,26 @@ def run_cli(case: Case, folder: Path) -> Outcome:
     del case
     out = Path(tempfile.mkdtemp(dir=folder.parent))
     try:
-        return _verb(["run", str(folder), "-o", str(out / "run"), "--jobs", "1", "--quiet"], {0, 3}, out / "run")
+        return call_verb(["run", str(folder), "-o", str(out / "run"), "--jobs", "1", "--quiet"], {0, 3}, out / "run")
     finally:
         shutil.rmtree(out, ignore_errors=True)
-
-
-def _verb(words: list[str], codes: set[int], run: Path | None = None) -> Outcome:
-    """Call the command line in this process."""
-    from sfm_audit.audit.cli.main import main  # noqa: PLC0415 - in the worker only
-
-    stderr, stdout, outcomes, code = io.StringIO(), io.StringIO(), list[Outcome](), 0
-    with _caught(outcomes), redirect_stderr(stderr), redirect_stdout(stdout):
-        code = main(words)
-    lines = stderr.getvalue().splitlines()
-    if outcomes:
-        return outcomes[0]
-    if code not in codes:
-        return Outcome("EXITCODE", f"{words[0]}: {code}: {lines[-1:]}")
-    if len(lines) > _MAX_STDERR_LINES or any("Traceback" in line or "Warning" in line for line in lines):
-        return Outcome("NOISE", f"{words[0]}: {len(lines)} lines: {lines[-1][:150] if lines else ''}")
-    infinite = infinite_columns(run) if run is not None and code in {0, 3} else []
-    if infinite:
-        return Outcome("NONFINITE", ", ".join(infinite))
-    return Outcome("refused" if code == 3 else "ok")
-
-
-def infinite_columns(run: Path) -> list[str]:
-    """Return the columns of a run folder's tables that hold infinities or NaN."""
-    import pyarrow.parquet as pq  # noqa: PLC0415 - in the worker only
-
-    found = []
-    for path in sorted(run.glob("*/part-*.parquet")):
-        table = pq.read_table(path)
-        for name in table.column_names:
-            column = table.column(name)
-            if str(column.type) in {"double", "float"}:
-                values = column.drop_null().to_numpy()
-                if not np.isfinite(values).all():
-                    found.append(f"{path.parent.name}.{name}")
-    return sorted(set(found))
 
 
 TARGETS: Final[Mapping[str, Target]] = {
     "models": Target(model_case, read_model, with_pycolmap=True),
     "files": Target(file_case, read_file),
     "run": Target(model_case, run_cli),
+    "run folders": Target(run_folder_case, read_run_folder),
 }
-"""Add a target here: how its inputs are drawn, and what is done with one. Run folders are damaged like models are:
-`draw` takes a finished run as its base, `run` calls the verbs on it with `_verb`."""
+"""Add a target here: how its inputs are drawn, and what is done with one."""
+
+
+def write_input(case: Case, folder: Path) -> None:
+    """Write any input into an existing, empty folder."""
+    if case.base in BASES:
+        write_run_folder(case, folder)
+    else:
+        write_case(case, folder)
 
 
 def attempt(target: str, case: Case) -> Outcome:
@@ -221,7 +147,7 @@ def attempt(target: str, case: Case) -> Outcome:
     try:
         folder = root / "in"
         folder.mkdir()
-        write_case(case, folder)
+        write_input(case, folder)
         return TARGETS[target].run(case, folder)
     finally:
         shutil.rmtree(root, ignore_errors=True)

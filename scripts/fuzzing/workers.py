@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from scripts.fuzzing.cases import PLACE, Case, write_case
-from scripts.fuzzing.targets import Outcome, attempt
+from scripts.fuzzing.outcomes import Outcome
+from scripts.fuzzing.targets import attempt
 
 _CONTEXT: Final = mp.get_context("spawn")
 _START_SECONDS: Final = 120.0

@@ -7,21 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from scripts.fuzzing import workers
+from scripts.fuzzing import run_folders, workers
 from scripts.fuzzing.cases import MODELS, Case, file_case, model_case, write_case
 from scripts.fuzzing.edits import Edit
-from scripts.fuzzing.targets import TARGETS, Outcome, attempt
+from scripts.fuzzing.outcomes import Outcome
+from scripts.fuzzing.targets import TARGETS, attempt
 from scripts.fuzzing.workers import Worker
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize(("target", "first"), [("models", 0), ("files", 10_000)])
+@pytest.mark.parametrize(("target", "first"), [("models", 0), ("files", 10_000), ("run folders", 20_000)])
 def test_some_of_a_campaign(target: str, first: int):
     draw = TARGETS[target].draw
     bad = [
         (case, outcome)
-        for case in (draw(7, first + i) for i in range(250))
+        for case in (draw(7, first + i) for i in range(8 if target == "run folders" else 250))
         if not (outcome := attempt(target, case)).is_good
     ]
     assert bad == []
@@ -46,6 +47,15 @@ def test_an_input_is_the_same_every_time(tmp_path: Path):
             contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
         assert contents[0] == contents[1]
     assert len({model_case(3, number).edits for number in range(50)}) > 45
+
+
+def test_a_list_that_differs_in_silence_is_seen():
+    case = Case(0, "damaged run", "", (Edit("readers", "1"),))
+    assert attempt("run folders", case).kind == "ok"
+    (run_folders._sound() / "all.txt").write_text("another.jpg\n")
+    found = attempt("run folders", case)
+    run_folders._sound.cache_clear()
+    assert found.kind == "SILENT"
 
 
 def fill(_case: Case, _folder: Path) -> Outcome:

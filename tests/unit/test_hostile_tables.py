@@ -131,10 +131,13 @@ def test_an_ignored_column_of_a_parquet_table_is_not_read(tmp_path: Path, monkey
     table = pa.table({**{name: pa.array([1.0, 2.0]) for name in "xyXYZ"}, "name": pa.array(["a", "b"])})
     pq.write_table(table.replace_schema_metadata({"width": "9", "height": "9"}), tmp_path / "t.parquet")
     read = []
-    real = pq.ParquetFile.read
-    monkeypatch.setattr(
-        pq.ParquetFile, "read", lambda self, columns, **kw: read.append(columns) or real(self, columns=columns, **kw)
-    )
+    real = pq.ParquetFile.iter_batches
+
+    def spy(self, *given, columns, **options):
+        read.append(columns)
+        return real(self, *given, columns=columns, **options)
+
+    monkeypatch.setattr(pq.ParquetFile, "iter_batches", spy)
     assert read_correspondences(tmp_path / "t.parquet").num == 2
     assert read == [[name] for name in "xyXYZ"]
 
