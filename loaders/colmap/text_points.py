@@ -5,13 +5,14 @@ Source: COLMAP 4.2 ``src/colmap/scene/reconstruction_io_text.cc``.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
 from sfm_audit.loaders.assembly.raw import RawPoints, offsets_of, order_of_points
 from sfm_audit.loaders.errors import LoadError, Position
 from sfm_audit.loaders.paths.text_lines import TextFile, is_number, parse_uint, repr_token
@@ -19,17 +20,23 @@ from sfm_audit.loaders.paths.text_lines import TextFile, is_number, parse_uint, 
 _BATCH: Final = 4096
 _NUM_FIXED: Final = 8
 _EXACT: Final = 2.0**53
+_WHOLE: Final = re.compile(rb"[+-]?[0-9]{1,10}")
+_NUM_SAFE_DIGITS: Final = 10  # numbers of fewer are below 2^31
 _LAYOUT: Final = "POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_IDX per track element"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Some lines' points: ids (p,), fixed (p, 8) as floats, tracks (t, 2), track lengths (p,)."""
+    """Some lines' points: ids (p,), fixed (p, 8) as floats, tracks (t, 2), track lengths (p,).
+
+    num_odd_colours: points whose colour COLMAP cannot read; it is not used here.
+    """
 
     ids: UInt64Array
     fixed: FloatArray
     tracks: UInt32Array
     track_lengths: IntArray
+    num_odd_colours: int = 0
 
 
 def read_points(file: TextFile) -> RawPoints:
@@ -49,7 +56,7 @@ def read_points(file: TextFile) -> RawPoints:
         track_lengths=np.concatenate([batch.track_lengths for batch in batches]),
         track_image_id=tracks[:, 0].copy(),
         track_point2d_idx=tracks[:, 1].copy(),
-        num_unused_nonfinite=int(np.count_nonzero(~_are_colours(fixed[:, 4:7]))),
+        num_unused_nonfinite=sum(batch.num_odd_colours for batch in batches),
     )
 
 
@@ -76,13 +83,16 @@ def _read_batch(file: TextFile, numbered: list[tuple[int, bytes]]) -> _Batch:
         exact = [parse_uint(file, line, row[0], "a 3D point id", 64) for (line, _), row in pairs]
         exact_ids = np.array(exact, dtype=np.uint64)
     fixed = values[at < _NUM_FIXED].reshape(-1, _NUM_FIXED)
-    return _Batch(exact_ids, fixed, tracks.astype(np.uint32).reshape(-1, 2), (lengths - _NUM_FIXED) // 2)
+    tracks_of_images = tracks.astype(np.uint32).reshape(-1, 2)
+    return _Batch(exact_ids, fixed, tracks_of_images, (lengths - _NUM_FIXED) // 2, _num_odd_colours(rows))
 
 
-def _are_colours(rgb: FloatArray) -> BoolArray:
-    """Whether colours (p, 3) are whole numbers that COLMAP can read, (p,); they are not used here."""
-    result: BoolArray = np.all((np.abs(rgb) < 2.0**31) & (rgb == np.floor(rgb)), axis=1)
-    return result
+def _num_odd_colours(rows: list[list[bytes]]) -> int:
+    """Count the points whose colour is not three whole numbers, as COLMAP reads them: 1.0 is none."""
+    colours = [token for row in rows for token in row[4:7]]
+    if b"".join(colours).isdigit() and len(max(colours, key=len)) < _NUM_SAFE_DIGITS:
+        return 0
+    return sum(not all(_WHOLE.fullmatch(token) and abs(int(token)) < 2**31 for token in row[4:7]) for row in rows)
 
 
 def _are_ids(values: FloatArray, bound: float) -> bool:

@@ -192,7 +192,10 @@ def _read_npz(file: BinaryIO, num_bytes: int) -> tuple[dict[str, NpzMember], dic
                     members[name] = NpzMember(entry, content, inert.protocol, inert.numpy_core)
                 if name in {*PER_IMAGE, *MATRICES, "pair_infos"}:
                     values[name] = value
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+    except (
+        *(zipfile.BadZipFile, zlib.error, EOFError),
+        *(ValueError, NotImplementedError, RuntimeError, MemoryError, OverflowError),  # sizes that the file makes up
+    ) as error:
         raise RefusedPickleError(f"a damaged archive ({' '.join(str(error).split())[:120]})") from error
     return members, values
 

@@ -97,7 +97,7 @@ def write_run_folder(case: Case, folder: Path) -> None:
         if edit.what == "damage":
             try:
                 by_name[edit.file](folder / "BAD", random.Random(edit.at))  # noqa: S311
-            except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+            except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 continue  # an earlier damage left nothing to do it to
 
 

@@ -123,6 +123,8 @@ def test_a_sound_rig_has_no_such_finding(tmp_path: Path):
         (b" 1 2 3 0.75 ", b" 1 nan 3 0.75 ", "1 colours"),
         (b" 1 2 3 0.75 ", b" 1 9223372036854775808 3 0.75 ", "1 colours"),
         (b" 1 2 3 0.75 ", b" 1 2.5 3 0.75 ", "1 colours"),
+        (b" 1 2 3 0.75 ", b" 1 2.0 3 0.75 ", "1 colours"),
+        (b" 1 2 3 0.75 ", b" 1 2147483648 3 0.75 ", "1 colours"),
         (b"30.0 40.0 -1", b"inf 40.0 -1", "1 unlinked 2D points"),
         (b"\n90 1.0 ", b"\n90 nan ", "1 poses that rigs and frames replace"),
     ],
