@@ -133,9 +133,9 @@ def test_an_ignored_column_of_a_parquet_table_is_not_read(tmp_path: Path, monkey
     read = []
     real = pq.ParquetFile.iter_batches
 
-    def spy(self, *given, columns, **options):
+    def spy(self, batch_size, *, columns, **options):
         read.append(columns)
-        return real(self, *given, columns=columns, **options)
+        return real(self, batch_size, columns=columns, **options)
 
     monkeypatch.setattr(pq.ParquetFile, "iter_batches", spy)
     assert read_correspondences(tmp_path / "t.parquet").num == 2
