@@ -77,7 +77,11 @@ def read_ptx(location: str | Path) -> GriddedScan:
         raise MalformedFileError(lines.path, None, "a point", "a scan without any return", _ADVICE)
     for first in range(0, num, _BATCH):  # in place: the points are in memory once
         part = slice(first, first + _BATCH)
-        xyz[part] = xyz[part] @ transformation[:3, :3] + transformation[3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):  # told below
+            xyz[part] = xyz[part] @ transformation[:3, :3] + transformation[3, :3]
+        if not np.isfinite(xyz[part]).all():
+            wanted = "points that its transformation leaves finite"
+            raise MalformedFileError(lines.path, None, wanted, "numbers beyond those of a computer", _ADVICE)
     xyz[is_missing] = np.nan
     return GriddedScan(xyz.reshape(num_columns, num_rows, 3).transpose(1, 0, 2), lines.path)
 

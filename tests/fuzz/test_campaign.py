@@ -108,6 +108,22 @@ def test_the_record_counts_pycolmap_s_answers_beside_ours(tmp_path: Path):
     assert found["failures"] == found["silent"] == []
 
 
+KNOWN = {
+    "the sizes of a damaged column": ("parquet", [("delete", 677, "2"), ("flip", 826, "1")]),
+    "a length that an archive makes up": ("npz", [("put", 588, "11ea2d819997713d")]),
+    "a transformation beyond all numbers": ("ptx", [("token", 24, "3165333038")]),
+    "columns of different lengths": ("parquet", [("flip", 1052, "5")]),
+}
+
+
+@pytest.mark.parametrize("what", KNOWN)
+def test_what_the_campaign_found_stays_refused(what: str):
+    """A crash of pyarrow, a MemoryError, a warning, a ValueError: numbers 216796, 204809, 219894 of seed 11."""
+    base, edits = KNOWN[what]
+    case = Case(0, base, "", tuple(Edit(kind, base, at, value) for kind, at, value in edits))
+    assert attempt("files", case).kind == "refused"
+
+
 def test_a_row_that_a_search_does_not_find_is_told():
     """Number 1177 of seed 21: a page of the table of keypoints points elsewhere."""
     case = Case(1177, "database", "", (Edit("put", "database", 18534, "ffffffff00000000"),))

@@ -68,7 +68,7 @@ def test_odd_text_is_read_as_colmap_reads_it_or_refused_by_line(tmp_path: Path, 
 @pytest.mark.parametrize("kind", ["wrong_sensor", "unknown_sensor"])
 def test_frames_that_name_another_sensor_are_told(tmp_path: Path, kind: str):
     subprocess.run([sys.executable, CASES / "frame_sensor.py", kind, tmp_path / "m"], check=True)
-    assert said_of(tmp_path / "m") == "sensors_disagree"
+    assert "sensors_disagree" in said_of(tmp_path / "m")
 
 
 def test_pickles_are_refused_at_once(tmp_path: Path):
