@@ -31,7 +31,8 @@ def test_some_of_a_campaign(target: str, first: int):
 def test_sound_inputs_are_sound():
     for base in MODELS:
         for layout in ("binary", "text"):
-            assert attempt("models", Case(0, base, layout, ())).kind == "ok", (base, layout)
+            wanted = "finding" if base == "rig" else "ok"  # the poses in its images file are not those of the rig
+            assert attempt("models", Case(0, base, layout, ())).kind == wanted, (base, layout)
     for base in ("csv", "parquet", "ptx", "pickle2", "pickle4", "npz", "database"):
         assert attempt("files", Case(0, base, "", ())).kind == "ok", base
 

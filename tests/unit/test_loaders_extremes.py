@@ -86,6 +86,11 @@ def test_numbers_as_large_as_doubles_are_read_without_a_warning(tmp_path: Path):
     assert not np.isfinite(image.cam_from_world(np.full((3, 3), 1e300))).any()
 
 
+def findings_but_poses(folder: Path):
+    """Findings without that on the poses in the images file: those of `rig_model` are meant to differ."""
+    return tuple(each for each in open_model(folder).findings if each.code != FindingCode.RIG_POSE_DISAGREES)
+
+
 SENSORS = {
     "another sensor of the rig": ((0, 1, 3), (0, 1, 4), (1, 5, 77)),
     "a sensor that the rig lacks": ((0, 1, 3), (0, 99, 4), (1, 5, 77)),
@@ -98,8 +103,8 @@ def test_a_frame_that_disagrees_about_the_sensor_of_an_image_is_a_finding(tmp_pa
     """pycolmap 4.1 refuses both (image.h:239, reconstruction.cc:445)."""
     model = rig_model()
     frames = (replace(model.frames[0], data=SENSORS[case]), model.frames[1])
-    findings = open_model(write(tmp_path, model.but(frames=frames))).findings
-    assert (FindingCode.SENSORS_DISAGREE, 1) in [(finding.code, finding.count) for finding in findings]
+    findings = findings_but_poses(write(tmp_path, model.but(frames=frames)))
+    assert [(finding.code, finding.count) for finding in findings] == [(FindingCode.SENSORS_DISAGREE, 1)]
     assert "image 4" in findings[0].text
 
 
@@ -108,13 +113,13 @@ def test_rigs_and_frames_that_name_what_does_not_exist(tmp_path: Path):
     extra = Rig(3, ((0, 55, None),))
     lost = Frame(10, 44, model.frames[0].pose, ())
     changed = model.but(rigs=(*model.rigs, extra), frames=(*model.frames, lost))
-    (finding,) = open_model(write_binary(tmp_path, changed)).findings
+    (finding,) = findings_but_poses(write_binary(tmp_path, changed))
     assert (finding.code, finding.count) == (FindingCode.SENSORS_DISAGREE, 2)
     assert "rig 3 has camera 55, which does not exist, and 1 more" in finding.text
 
 
 def test_a_sound_rig_has_no_such_finding(tmp_path: Path):
-    assert open_model(write_binary(tmp_path, rig_model())).findings == ()
+    assert findings_but_poses(write_binary(tmp_path, rig_model())) == ()
 
 
 @pytest.mark.parametrize(
@@ -135,6 +140,6 @@ def test_text_that_colmap_refuses_where_nothing_is_read_from_is_told(tmp_path: P
     for name in ("images.txt", "points3D.txt"):
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content.replace(old, new, 1))
-    (finding,) = open_model(tmp_path).findings
+    (finding,) = findings_but_poses(tmp_path)
     assert finding.code == FindingCode.NON_FINITE_UNUSED
     assert what in finding.text
