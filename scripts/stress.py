@@ -1,10 +1,10 @@
 """What is extreme and allowed: scales, offsets, sizes and numbers of things, each in a process of its own.
 
-    scripts/stress.py              all of it, an hour
+    scripts/stress.py              all of it, the full size
     scripts/stress.py --quick      small, three minutes; exit code 1 where a limit is exceeded
     scripts/stress.py --only scales --only images
 
-docs/stress.md holds measured numbers. Memory is the peak over what the imports took (VmHWM), time is CPU time.
+docs/reliability.md holds measured numbers. Memory is the peak over what the imports took (VmHWM), time is CPU time.
 """
 
 from __future__ import annotations

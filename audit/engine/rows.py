@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.columns import IMPLIED, OUTSIDE_COLUMNS, own_parameter_names
 from sfm_audit.audit.table.witnesses import Witness
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
 
@@ -283,7 +284,7 @@ def camera_row(
         "advised_camera_model": audit.advised_camera_model,
         **own_columns(own_diagnostics(step, math.nan) if step else None),
         "own_parameters": list(step.names) if step else None,
-        "own_correlations": step.correlation[np.tril_indices(len(step.names), -1)] if step else None,
+        "own_correlations": _below_diagonal(step.correlation) if step else None,
         **{name: implied.get(name, math.nan) for name in (*IMPLIED, *(f"{name}_sd" for name in IMPLIED))},
         "sd_focal_rel_joint": step.sd_focal_rel if step else math.nan,
         "joint_blocks": joint.num_blocks if joint else None,
@@ -326,3 +327,8 @@ def model_row(
         "witnesses": [str(each) for each in witnesses] or None,
         "findings": list(findings),
     }
+
+
+def _below_diagonal(correlation: FloatArray) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
+    """Return the values below the diagonal of (q, q), row by row; masked where they are not known."""
+    return np.ma.masked_invalid(correlation[np.tril_indices(len(correlation), -1)])

@@ -109,7 +109,8 @@ def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes
         for image_idx, name in enumerate(images.name):
             keypoints = stored_keypoints(path, db, (name, rows_of.get(name)), int(images.num_points2d[image_idx]))
             rows = slice(*observations.offsets[image_idx : image_idx + 2])
-            linked = keypoints[observations.point2d_idx[rows], 2:].astype(np.float64)
+            with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+                linked = keypoints[observations.point2d_idx[rows], 2:].astype(np.float64)
             scale[rows], orientation[rows] = _shape_of(linked)
     return KeypointShapes(str(path), scale, orientation)
 

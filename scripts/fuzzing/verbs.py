@@ -5,10 +5,13 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from scripts.fuzzing.outcomes import Outcome, caught
+
+_AS_STORED: Final = frozenset({"params"})  # the claims of a file, whatever they are
 
 
 def call_verb(words: list[str], codes: set[int], run: Path | None = None, *, max_lines: int = 2) -> Outcome:
@@ -33,15 +36,19 @@ def call_verb(words: list[str], codes: set[int], run: Path | None = None, *, max
 
 def infinite_columns(run: Path) -> list[str]:
     """Return the columns of a run folder's tables that hold infinities or NaN."""
-    import pyarrow.parquet as pq  # noqa: PLC0415 - in the worker only
+    import pyarrow as pa  # noqa: PLC0415 - in the worker only
+    import pyarrow.compute as pc  # noqa: PLC0415 - as above
+    import pyarrow.parquet as pq  # noqa: PLC0415 - as above
 
     found = []
     for path in sorted(run.glob("*/part-*.parquet")):
         table = pq.read_table(path)
-        for name in table.column_names:
+        for name in set(table.column_names) - _AS_STORED:
             column = table.column(name)
-            if str(column.type) in {"double", "float"}:
-                values = column.drop_null().to_numpy()
+            if pa.types.is_list(column.type):
+                column = pc.list_flatten(column)
+            if pa.types.is_floating(column.type):
+                values = column.drop_null().to_numpy(zero_copy_only=False)
                 if not np.isfinite(values).all():
                     found.append(f"{path.parent.name}.{name}")
     return sorted(set(found))
