@@ -127,10 +127,10 @@ def _list_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
         raise TypeError(f"expected a list type, found {kind}")
     if pa.types.is_floating(kind.value_type):
         parts = [np.ma.asarray(part, dtype=np.float64) for part in values if part is not None]
-        numbers = np.ma.concatenate([np.empty(0), *parts])
-        known = _validity(~np.ma.getmaskarray(numbers))
-        data = _buffer(np.ma.getdata(numbers))
-        child: pa.Array[Any] = pa.Array.from_buffers(kind.value_type, len(numbers), [known, data])
+        numbers = np.concatenate([np.empty(0), *(part.filled(np.nan) for part in parts)])
+        known = ~np.concatenate([np.empty(0, bool), *(np.ma.getmaskarray(part) for part in parts)])
+        buffers = [_validity(known), _buffer(numbers)]
+        child: pa.Array[Any] = pa.Array.from_buffers(kind.value_type, len(numbers), buffers)
     else:
         items = [item for part in values if part is not None for item in part]
         child = _build_array(items, kind.value_type)

@@ -50,8 +50,12 @@ def main(args: Sequence[str] | None = None) -> None:
         sound.mkdir()
         (options.corpus / "sound").write_bytes(_sound(cases, options.kind, sound))
 
+        read = targets.read_file if options.kind in cases.FILES else targets.read_model
+
         def one(data: bytes) -> None:
-            found = _attempt(cases, targets, options.kind, sound, Path(folder, "in"), data)
+            place = Path(folder, "in")
+            _place(options.kind, sound, place, data)
+            found = read(cases.Case(0, options.kind, "", ()), place)
             if not found.is_good:
                 raise WrongOutcomeError(f"{found.kind} {found.where}")
 
@@ -70,12 +74,11 @@ def _sound(cases: Any, kind: str, folder: Path) -> bytes:
     return (folder / kind).read_bytes()
 
 
-def _attempt(cases: Any, targets: Any, kind: str, sound: Path, folder: Path, data: bytes) -> Any:
+def _place(kind: str, sound: Path, folder: Path, data: bytes) -> None:
+    """Write an input, beside the sound files of its model, into ``folder``."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(sound, folder)
     (folder / kind).write_bytes(data)
-    read = targets.read_file if kind in cases.FILES else targets.read_model
-    return read(cases.Case(0, kind, "", ()), folder)
 
 
 if __name__ == "__main__":

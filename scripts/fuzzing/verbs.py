@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def infinite_columns(run: Path) -> list[str]:
     for path in sorted(run.glob("*/part-*.parquet")):
         table = pq.read_table(path)
         for name in set(table.column_names) - _AS_STORED:
-            column = table.column(name)
+            column: Any = table.column(name)
             if pa.types.is_list(column.type):
                 column = pc.list_flatten(column)
             if pa.types.is_floating(column.type):
