@@ -231,8 +231,8 @@ def _add_facts(file: TextStream, line: int, record: bytes, facts: dict[str, str]
     """Add the ``key=value`` of a comment above the line of column names."""
     for key, value in _FACT.findall(record.decode("utf-8", errors="backslashreplace")):
         if facts.setdefault(key, value) != value:
-            stated, other = (repr_token(each.encode()) for each in (facts[key], value))
-            raise file.malformed(line, f"{key[:40]} to be {stated}, as further up", other)
+            stated, other = (repr_token(f"{key}={each}".encode()).strip("'") for each in (facts[key], value))
+            raise file.malformed(line, f"{stated}, as further up", other)
         if len(facts) > _MAX_FACTS:
             raise file.malformed(line, f"at most {_MAX_FACTS} comments of the form key=value", "more")
 
