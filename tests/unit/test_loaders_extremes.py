@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from model_writer import Frame, Rig, noisy_model, rig_model, write_binary, write_text
+from placed_models import open_model
 
-from sfm_audit.loaders import FindingCode, open_model
+from sfm_audit.loaders import FindingCode
 
 CAMERA = (500.0, 320.0, 240.0, 0.0)
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from model_writer import Frame, Rig, rig_model, write_binary, write_text
 from numpy.testing import assert_allclose, assert_array_equal
+from placed_models import open_model
 from scipy.spatial.transform import Rotation
 
-from sfm_audit.loaders import FindingCode, open_model
+from sfm_audit.loaders import FindingCode
 
 SOURCE = rig_model()
 FRONT, BACK = (frame.pose for frame in SOURCE.frames)
