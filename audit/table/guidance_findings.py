@@ -109,9 +109,9 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
         "That a list of names tells such images apart.",
     ),
     FindingCode.INCOMPLETE_RIGS: Guidance(
-        "One of rigs.bin and frames.bin was not copied; images that belong to no frame.",
+        "One of the two files of rigs and frames was not copied; images that belong to no frame.",
         "Copy both files, or export the model without rigs.",
-        "That poses in images.bin were used where both files are there: they are not.",
+        "That poses in the images file were used where both files are there: they are not.",
     ),
     FindingCode.SENSORS_DISAGREE: Guidance(
         "Camera ids renumbered in one of the files.",
