@@ -125,10 +125,13 @@ if kind in ("npz", "pickle"):
 
 
 @pytest.mark.parametrize(
-    ("kind", "most"), [("csv", 3.0), ("parquet", 3.0), ("ptx", 3.0), ("npz", 3.0), ("pickle", 8.0)]
+    ("kind", "most"), [("csv", 3.0), ("parquet", 4.5), ("ptx", 3.0), ("npz", 3.0), ("pickle", 8.0)]
 )
 def test_another_file_takes_a_few_times_its_size(tmp_path: Path, kind: str, most: float):
-    """A pickle of many small arrays costs more: an array of 2 numbers is 60 bytes in the file and 200 in memory."""
+    """A pickle of many small arrays costs more: an array of 2 numbers is 60 bytes in the file and 200 in memory.
+
+    The limit has 300 MB beside it, of which what Arrow keeps for itself (up to 60 MB) is a part.
+    """
     subprocess.run([sys.executable, "-c", WRITE, kind, tmp_path / kind], check=True)
     command = [sys.executable, "-c", PEAK + OTHERS[kind] + MEASURE_OTHERS, tmp_path / kind]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
