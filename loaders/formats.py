@@ -13,6 +13,7 @@ from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFile
 from sfm_audit.loaders.foreign.bal import BAL
 from sfm_audit.loaders.foreign.blocks_exchange import BLOCKS_EXCHANGE
 from sfm_audit.loaders.foreign.bundler import BUNDLER
+from sfm_audit.loaders.foreign.kapture import KAPTURE
 from sfm_audit.loaders.foreign.nvm import NVM
 from sfm_audit.loaders.foreign.openmvg import OPENMVG
 from sfm_audit.loaders.foreign.opensfm import OPENSFM
@@ -21,7 +22,7 @@ from sfm_audit.loaders.model_format import ModelFormat, ModelWriter, matching
 from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
 
-FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL, BLOCKS_EXCHANGE)
+FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL, BLOCKS_EXCHANGE, KAPTURE)
 """Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
 
 WITHOUT_POINTS: Final[Mapping[str, str]] = {

@@ -366,3 +366,37 @@ def blocks_exchange_xml(made: Scene, orientation: str = "XRightYDown", system: s
 
 def blocks_exchange_files(made: Scene, orientation: str = "XRightYDown") -> dict[str, bytes]:
     return {"BlocksExchange.xml": blocks_exchange_xml(made, orientation).encode()}
+
+
+def kapture_files(made: Scene, *, with_rig: bool = False) -> dict[str, bytes]:
+    """kapture/io/csv.py, format 1.1; COLMAP's camera RADIAL."""
+    lens = made.lens
+    head = "# kapture format: 1.1\n"
+    values = [made.width, made.height, *(float(lens.get(name, 0.0)) for name in ("fx", "cx", "cy", "k1", "k2"))]
+    sensors = f"cam0, , camera, RADIAL, {', '.join(map(repr, values))}\n"
+    records, trajectories, keypoints = "", "", {}
+    positions = {}
+    for row, (quat, translation) in enumerate(zip(quats(made), made.translations, strict=True)):
+        device, moved = ("rig", translation - [0.5, 0.0, 0.25]) if with_rig else ("cam0", translation)
+        records += f"{row}, cam0, {row}.jpg\n"
+        trajectories += f"{row}, {device}, {', '.join(map(repr, [*quat.tolist(), *moved.tolist()]))}\n"
+        seen = np.flatnonzero(made.image_idx == row)
+        positions |= {k: position for position, k in enumerate(seen)}
+        extra = np.full((len(seen), 2), 7.0)
+        content = np.hstack([made.xy[seen], extra]).astype("<f8").tobytes()
+        keypoints[f"reconstruction/keypoints/SIFT/{row}.jpg.kpt"] = content
+    points = "".join(", ".join(map(repr, xyz)) + ", 1, 2, 3\n" for xyz in made.points.tolist())
+    observations = ""
+    for row, (_, seen) in enumerate(by_point(made)):
+        words = [word for k in seen for word in (f"{made.image_idx[k]}.jpg", str(positions[k]))]
+        observations += ", ".join([str(row), "SIFT", *words]) + "\n"
+    files = {
+        "sensors/sensors.txt": sensors,
+        "sensors/records_camera.txt": records,
+        "reconstruction/points3d.txt": points,
+    }
+    files |= {"sensors/trajectories.txt": trajectories, "reconstruction/observations.txt": observations}
+    files |= {"reconstruction/keypoints/SIFT/keypoints.txt": "SIFT, float64, 4\n"}
+    if with_rig:
+        files["sensors/rigs.txt"] = "rig, cam0, 1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.25\n"
+    return {name: (head + text).encode() for name, text in files.items()} | keypoints

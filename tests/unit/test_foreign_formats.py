@@ -35,6 +35,8 @@ FORMATS = {
     "opensfm fisheye": ("opensfm", fs.opensfm_files, {}, "fisheye", "RADIAL_FISHEYE", False),
     "opensfm panorama": ("opensfm", fs.opensfm_files, {}, "spherical", "EQUIRECTANGULAR", False),
     "blocks": ("blocks_exchange", fs.blocks_exchange_files, {"cx": 4.0}, "perspective", "RADIAL", False),
+    "kapture": ("kapture", fs.kapture_files, {}, "perspective", "RADIAL", False),
+    "kapture rig": ("kapture", lambda made: fs.kapture_files(made, with_rig=True), {}, "perspective", "RADIAL", False),
     "openmvg pinhole": ("openmvg", openmvg("pinhole"), PLAIN, "perspective", "SIMPLE_PINHOLE", False),
     "openmvg k1": ("openmvg", openmvg("pinhole_radial_k1"), {"k2": 0.0}, "perspective", "SIMPLE_RADIAL", False),
     "openmvg k3": ("openmvg", openmvg("pinhole_radial_k3", wrapped=True), {"cx": 4.0}, "perspective", "RADIAL", False),
@@ -70,7 +72,7 @@ def assert_same_rows(ours: pa.Table, theirs: pa.Table) -> None:
 def test_the_table_is_that_of_the_same_scene_from_colmap(tmp_path, name):
     file_format, write, lens, kind, twin_model, camera_per_image = FORMATS[name]
     made = fs.scene(lens, kind=kind)
-    folder = fs.write(tmp_path / "ours", write(made))
+    folder = fs.write(tmp_path / "ours", write(made)) / ("reconstruction" if file_format == "kapture" else "")
     ours = open_model(folder)
     fs.write_colmap(tmp_path / "twin", made, twin_model, camera_per_image=camera_per_image)
     twin = open_model(tmp_path / "twin")
@@ -87,7 +89,7 @@ def test_the_table_is_that_of_the_same_scene_from_colmap(tmp_path, name):
 
     assert count_images(str(folder)) == len(made.rotations)
     (ref,) = discover([tmp_path / "ours"]).refs
-    assert ref.num_bytes == sum(len(content) for content in write(made).values())
+    assert ref.num_bytes == sum(len(content) for path, content in write(made).items() if "keypoints" not in path)
 
 
 def test_bundler_and_bal_residuals_are_their_own(tmp_path):
@@ -394,3 +396,32 @@ def test_metashape_s_cameras_have_no_tie_points(tmp_path):
         LoadError, match=r"found cameras.xml, Metashape's own export of cameras, holds no tie points; export"
     ):
         open_model(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("reconstruction/observations.txt", b"0.jpg", b"../../0.jpg", None),
+        ("reconstruction/observations.txt", b"SIFT", b"../SIFT", "names of images and keypoints inside the folder"),
+        ("reconstruction/observations.txt", b"format: 1.1", b"format: 1.0", "expected kapture format: 1.1, found 1.0"),
+        ("sensors/sensors.txt", b"RADIAL", b"BROWN", "a camera model of COLMAP's, found 'BROWN'"),
+        ("sensors/records_camera.txt", b"1.jpg", b"0.jpg", "an image that the file has not named before"),
+        ("reconstruction/keypoints/SIFT/keypoints.txt", b"float64", b"object", "the dtype float32 or float64"),
+        ("reconstruction/keypoints/SIFT/keypoints.txt", b", 4", b", 7", "rows of 7 numbers of 8 bytes"),
+    ],
+)
+def test_what_is_wrong_with_kapture_is_said_and_no_file_outside_is_opened(tmp_path, file, old, new, message):
+    files = fs.kapture_files(fs.scene())
+    assert old in files[file]
+    folder = fs.write(tmp_path, files | {file: files[file].replace(old, new, 1)}) / "reconstruction"
+    if message is None:
+        assert FindingCode.OBSERVATIONS_WITHOUT_IMAGE in {finding.code for finding in open_model(folder).findings}
+        return
+    with pytest.raises(LoadError, match=message):
+        open_model(folder)
+
+
+def test_a_kapture_image_whose_name_leads_out_has_no_keypoints(tmp_path):
+    files = {name: text.replace(b"0.jpg", b"../../0.jpg") for name, text in fs.kapture_files(fs.scene()).items()}
+    with pytest.raises(LoadError, match=r"names of images and keypoints inside the folder, found '../../0.jpg"):
+        open_model(fs.write(tmp_path, files) / "reconstruction")
