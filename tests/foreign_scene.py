@@ -225,15 +225,8 @@ def write(folder: Path, files: dict[str, bytes]) -> Path:
 def opensfm_camera(made: Scene) -> dict:
     """io.py, camera_to_json: focal lengths and principal points as shares of the larger side."""
     size = max(made.width, made.height)
-    kinds = {
-        "perspective": "perspective",
-        "fisheye": "fisheye",
-        "spherical": "spherical",
-        "brown": "brown",
-        "dual": "dual",
-    }
     lens, kind = made.lens, made.kind
-    out = {"projection_type": kinds[kind], "width": made.width, "height": made.height}
+    out = {"projection_type": kind, "width": made.width, "height": made.height}
     if kind == "spherical":
         return out
     if {"p1", "k3", "cx_shift"} & set(lens) or lens["fx"] != lens["fy"]:
@@ -382,8 +375,7 @@ def kapture_files(made: Scene, *, with_rig: bool = False) -> dict[str, bytes]:
         trajectories += f"{row}, {device}, {', '.join(map(repr, [*quat.tolist(), *moved.tolist()]))}\n"
         seen = np.flatnonzero(made.image_idx == row)
         positions |= {k: position for position, k in enumerate(seen)}
-        extra = np.full((len(seen), 2), 7.0)
-        content = np.hstack([made.xy[seen], extra]).astype("<f8").tobytes()
+        content = np.hstack([made.xy[seen], made.xy[seen]]).astype("<f8").tobytes()
         keypoints[f"reconstruction/keypoints/SIFT/{row}.jpg.kpt"] = content
     points = "".join(", ".join(map(repr, xyz)) + ", 1, 2, 3\n" for xyz in made.points.tolist())
     observations = ""
