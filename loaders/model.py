@@ -70,6 +70,7 @@ class FindingCode(StrEnum):
     IMAGE_SIZE_ASSUMED = "image_size_assumed"
     OBSERVATIONS_WITHOUT_IMAGE = "observations_without_image"
     SEVERAL_RECONSTRUCTIONS = "several_reconstructions"
+    POSSIBLE_FOLD = "possible_fold"
 
 
 FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
@@ -123,6 +124,7 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.WEAKLY_CONNECTED: "parts of the model hang together by few points, or by one image or pair alone",
     FindingCode.RIG_POSE_DISAGREES: "poses in the images file differ from those of frames and rigs, which were read",
     FindingCode.RIG_NOT_CONSTANT: "images of a rig would move against their frame: the rig is not rigid, or misplaced",
+    FindingCode.POSSIBLE_FOLD: "two groups of images side by side see different points: folded, or two times of day",
 }
 """One line per finding, for docs/findings.md."""
 

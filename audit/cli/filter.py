@@ -26,6 +26,7 @@ from sfm_audit.reports.export.selection import (
     as_bytes,
     images_of_model,
     list_text,
+    on_side,
     read_images,
     removed_text,
 )
@@ -55,6 +56,11 @@ class _Request:
     show_default=True,
     help="Keep all that was not rejected, or only what was accepted.",
 )
+@click.option(
+    "--keep-group",
+    type=click.IntRange(1, 2),
+    help="Keep this side of folded models (fold_group): the images of the other side go.",
+)
 @click.option("--list", "list_out", metavar="F", type=_PATH, help="Write the names of the kept images; - is stdout.")
 @click.option("--model", metavar="MODEL", type=_PATH, help="A COLMAP model that RUN audited ...")
 @click.option("--model-out", metavar="DIR", type=_PATH, help="... and where to write it without the other images.")
@@ -66,6 +72,7 @@ def command(
     *,
     run_folder: Path,
     keep: str,
+    keep_group: int | None,
     list_out: Path | None,
     model: Path | None,
     model_out: Path | None,
@@ -94,7 +101,7 @@ def command(
     _refuse_stdout(scene_info_out, "scene-info-out")
     given = [path for path in (run_folder, model, scene_info) if path is not None]
     _check_outputs([path for path in outputs if not is_stdout(path)], given, model_out, force)
-    request = _open(run_folder, Keep(keep), Again.of(**again))
+    request = _open(run_folder, Keep(keep), Again.of(**again), keep_group)
     steps: list[Callable[[], str]] = []
     if list_out is not None:
         steps.append(lambda: _write_list(request, list_out))
@@ -127,13 +134,14 @@ def _check_outputs(outputs: Sequence[Path], inputs: Sequence[Path], model_out: P
             raise KnownError(str(error), ExitCode.OUTPUT) from error
 
 
-def _open(run_folder: Path, keep: Keep, again: Again) -> _Request:
+def _open(run_folder: Path, keep: Keep, again: Again, keep_group: int | None) -> _Request:
     try:
         run = again.read(open_run(run_folder))
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     try:
-        return _Request(run, read_images(run), keep)
+        images = read_images(run)
+        return _Request(run, images if keep_group is None else on_side(run, images, keep_group), keep)
     except DamagedRunError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     except RunFolderError as error:

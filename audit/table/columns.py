@@ -129,6 +129,8 @@ _OUTSIDE: Final = (
     count("covisible_part", "which part of the model it is in at 15 shared points; 0 is the largest"),
     flag("is_articulation", "whether the model falls apart without it"),
     px("rig_offset_px", "what moving it alone, against its frame, would remove; null where no rig places it"),
+    number("fold_score", "of the model: share of common points that close images of different fold_group lack"),
+    count("fold_group", "1 or 2: side of the image if the model is folded; null where no sides can be told apart"),
 )
 OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.type == pa.float64() else None for column in _OUTSIDE}
 """What witnesses outside of the image measure, and what stands there where they measured nothing."""

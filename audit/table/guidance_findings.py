@@ -259,4 +259,9 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
         "Export the component you mean, or take each for itself.",
         "That their scales or places relative to each other mean anything.",
     ),
+    FindingCode.POSSIBLE_FOLD: Guidance(
+        "Opposite sides of a symmetric building put together; day and night; a loop that was not closed.",
+        "Compare with another reconstruction (check --baseline) or ask the database; filter --keep-group keeps one side.",
+        "That the model is folded: one in five right models of real photos looks so.",
+    ),
 }

@@ -13,7 +13,7 @@ import json
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
@@ -45,7 +45,10 @@ class Keep(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AuditedImage:
-    """One image of a run: what it is called, and what the audit said."""
+    """One image of a run: what it is called, and what the audit said.
+
+    fold_group: its side, should the model be folded; None unknown.    is_on_other_side: than the one to keep.
+    """
 
     dataset: str
     scene: str
@@ -55,6 +58,8 @@ class AuditedImage:
     image_name: str
     verdict: str
     reasons: tuple[str, ...]
+    fold_group: int | None = None
+    is_on_other_side: bool = False
 
     @property
     def model(self) -> str:
@@ -63,6 +68,8 @@ class AuditedImage:
 
     def is_kept(self, keep: Keep) -> bool:
         """Whether the image stays."""
+        if self.is_on_other_side:
+            return False
         return self.verdict == "accepted" if keep is Keep.ACCEPTED else self.verdict != "rejected"
 
 
@@ -76,13 +83,34 @@ def read_images(run: RunReader) -> tuple[AuditedImage, ...]:
     """
     if run.info.get("status") != "complete":
         raise RunFolderError(run.folder, "holds a run that was not finished", "give its command again first")
-    images = [AuditedImage(**{**row, "reasons": tuple(row["reasons"] or ())}) for row in run.rows("images", COLUMNS)]
+    rows = run.rows("images", (*COLUMNS, "fold_group"))
+    images = [AuditedImage(**{**row, "reasons": tuple(row["reasons"] or ())}) for row in rows]
     if not images:
         raise RunFolderError(run.folder, "holds no audited image", "run it over a dataset that can be read")
     return tuple(
         sorted(
             images, key=lambda image: (image.dataset, image.scene, image.component, image.model_path, image.image_id)
         )
+    )
+
+
+def on_side(run: RunReader, images: Sequence[AuditedImage], group: int) -> tuple[AuditedImage, ...]:
+    """Mark the images that are on the other side of their model's fold than ``group``, 1 or 2; with a reason.
+
+    Raises
+    ------
+    RunFolderError
+        No model of the run has sides.
+    """
+    if not any(image.fold_group for image in images):
+        advice = "its models are too small, or made by an older version; docs/method.md 13 says what it takes"
+        raise RunFolderError(run.folder, "holds no fold_group", advice)
+    other = 3 - group
+    return tuple(
+        replace(image, is_on_other_side=True, reasons=(*image.reasons, f"fold_group: {other}"))
+        if image.fold_group == other
+        else image
+        for image in images
     )
 
 

@@ -62,7 +62,7 @@ def test_types_are_design_s(column):  # noqa: C901 # one branch per kind of colu
     elif (
         column.name.startswith("num_")
         or column.name.endswith(("_rank", "_rank_joint"))
-        or column.name in {"occupied_cells", "joint_blocks", "own_num_images", "covisible_part"}
+        or column.name in {"occupied_cells", "joint_blocks", "own_num_images", "covisible_part", "fold_group"}
     ):
         wanted = pa.int64()
     elif column.name in {"noise_converged", "folds_over", "misfit_material", "half_pixel", "is_articulation"}:

@@ -1,0 +1,165 @@
+"""Do two groups of images look at the same place, and each sees points of its own? So a folded model looks.
+
+Opposite sides of a symmetric building are put on top of each other: what looks the same is merged, what tells the sides
+apart is seen by one side alone, although images of the other side stand beside it. Two images that stand beside each
+other see the same points less often where they are of different sides than where they are of the same one.
+
+The model alone cannot tell that from other reasons to see different points: day and night, a loop that the matcher did
+not close, leaves. So this is a remark with the two groups, no verdict (docs/method.md 13 has its rates).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.linalg import eigh
+
+from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
+from sfm_audit.audit.witnesses.should_see import MAX_ANGLE_DEG, MAX_DISTANCE_RATIO, ShouldSee, should_see
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.model import Finding, FindingCode
+
+MIN_IMAGES: Final = 12
+MAX_IMAGES: Final = 4000
+"""Pairs of images are held as a full matrix; above that nothing is asked."""
+MIN_POINTS: Final = 500
+MIN_SCORE: Final = 0.15
+"""Share of common points that images of different groups lack, from which the model is remarked on."""
+MIN_MIXED: Final = 0.7
+"""Close pairs across the groups / those that groups scattered at random would have."""
+_MIN_GROUP: Final = 3
+_MIN_EITHER: Final = 8  # points that either of two images sees and both should
+_NUM_SPLITS: Final = 3
+_STEP_DEG: Final = 1.0  # pairs are compared with pairs of the same angle
+_MIN_PAIRS: Final = 4  # in such a step, in either group, and half as many across
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """Two groups of images that look at the same place and see less of the same than others so close.
+
+    score: 1 - common points of close pairs across the groups / those of pairs within them, at the same angles.
+    mixed: close pairs across / those of groups scattered at random.    group: (I,) 1 the larger, 2, 0 neither.
+    """
+
+    score: float
+    mixed: float
+    group: IntArray
+
+    @property
+    def is_remarkable(self) -> bool:
+        """Whether the model is remarked on."""
+        return self.score > MIN_SCORE and self.mixed > MIN_MIXED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClosePairs:
+    """Pairs of images (I, I), symmetric: points that both or either of two images see and both should.
+
+    close: close enough to see the same.    step: the angle between them, in steps.
+    """
+
+    both: FloatArray
+    either: FloatArray
+    close: BoolArray
+    step: IntArray
+
+
+def ask_fold(evidence: Evidence) -> WitnessReport | None:
+    """Report the two groups of every model that is large enough, and a finding where they are remarkable."""
+    num_images = len(evidence.model.images)
+    if not MIN_IMAGES <= num_images <= MAX_IMAGES:
+        return None
+    found = find_fold(should_see(evidence.model, evidence.residuals))
+    if found is None:
+        return None
+    group = tuple(int(g) if g else None for g in found.group)
+    columns: dict[str, ColumnValues] = {"fold_score": np.full(num_images, found.score), "fold_group": group}
+    return WitnessReport(None, columns=columns, findings=tuple(_findings(found)))
+
+
+def _findings(found: Fold) -> Iterator[Finding]:
+    if found.is_remarkable:
+        sizes = [int(np.count_nonzero(found.group == k)) for k in (1, 2)]
+        text = (
+            f"two groups of {sizes[0]} and {sizes[1]} images (fold_group) stand side by side and have "
+            f"{found.score:.0%} fewer points in common than images so close within a group: folded, or two times of day"
+        )
+        yield Finding(FindingCode.POSSIBLE_FOLD, sizes[1], text)
+
+
+def find_fold(seen: ShouldSee) -> Fold | None:
+    """Return the two groups that have least in common for how close they are; None where none can be told apart."""
+    if seen.num_points < MIN_POINTS:
+        return None
+    pairs = _close_pairs(seen)
+    found = [_judged(split, pairs) for split in _splits(seen)]
+    told = [fold for fold in found if fold is not None]
+    return max(told, key=lambda fold: (fold.mixed > MIN_MIXED, fold.score), default=None)
+
+
+def _splits(seen: ShouldSee) -> Iterator[BoolArray]:
+    """Yield splits of the images by the leading eigenvectors of their co-detection, given who should see."""
+    num = np.bincount(seen.point, minlength=seen.num_points)
+    rate = np.bincount(seen.point, seen.sees, minlength=seen.num_points) / np.maximum(num, 1)
+    rest = seen.matrix(seen.sees - rate[seen.point])
+    together = (rest.T @ rest).toarray()
+    size = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
+    together /= size[:, None] * size
+    np.fill_diagonal(together, 0.0)
+    vectors = _leading(together)
+    for k in range(vectors.shape[1]):
+        yield vectors[:, k] > 0
+
+
+def _leading(symmetric: FloatArray) -> FloatArray:
+    """Return the eigenvectors of the largest eigenvalues (n, _NUM_SPLITS)."""
+    n = len(symmetric)
+    vectors: FloatArray = eigh(symmetric, subset_by_index=(n - _NUM_SPLITS, n - 1))[1][:, ::-1]
+    return vectors
+
+
+def _close_pairs(seen: ShouldSee) -> _ClosePairs:
+    """Compare all pairs of images over the points that both should see."""
+    should, sees = seen.matrix(np.ones(len(seen.point))), seen.matrix(seen.sees)
+    both = (sees.T @ sees).toarray()
+    half = (sees.T @ should).toarray()
+    either = half + half.T - both
+    num = np.maximum((should.T @ should).toarray(), 1.0)
+    rays = [seen.matrix(seen.ray[:, k]) for k in range(3)]
+    cosine = np.sum([(ray.T @ ray).toarray() for ray in rays], axis=0) / num
+    logs = (seen.matrix(np.log(seen.distance)).T @ should).toarray()
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    close = (either >= _MIN_EITHER) & (angle < MAX_ANGLE_DEG)
+    close &= np.abs(logs - logs.T) < np.log(MAX_DISTANCE_RATIO) * num
+    np.fill_diagonal(close, val=False)
+    return _ClosePairs(both, either, close, (angle / _STEP_DEG).astype(np.int64))
+
+
+def _judged(split: BoolArray, pairs: _ClosePairs) -> Fold | None:
+    """Measure how much less two groups see of the same; None where they are hardly beside each other."""
+    takes_part = pairs.close.any(axis=1)
+    group = np.where(takes_part, np.where(split, 1, 2), 0)
+    sizes = np.bincount(group, minlength=3)
+    if min(sizes[1], sizes[2]) < _MIN_GROUP:
+        return None
+    if sizes[2] > sizes[1]:
+        group = np.where(group > 0, 3 - group, 0)
+    across = pairs.close & (split[:, None] != split)
+    missing = expected = num_across = 0.0
+    for step in range(int(MAX_ANGLE_DEG / _STEP_DEG)):
+        here = pairs.close & (pairs.step == step)
+        cross, within = here & across, here & ~across
+        if np.count_nonzero(cross) >= _MIN_PAIRS // 2 and np.count_nonzero(within) >= _MIN_PAIRS:
+            share = pairs.both[within].sum() / pairs.either[within].sum()
+            expected += share * pairs.either[cross].sum()
+            missing += share * pairs.either[cross].sum() - pairs.both[cross].sum()
+            num_across += np.count_nonzero(cross)
+    if expected <= 0:
+        return None
+    first = sizes[1] / (sizes[1] + sizes[2])
+    at_random = 2 * first * (1 - first) * np.count_nonzero(pairs.close)
+    return Fold(float(missing / expected), float(num_across / at_random), group)

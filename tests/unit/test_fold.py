@@ -1,0 +1,147 @@
+"""Two groups of images at one place that see different points (method.md section 13)."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gate_samples import scene, write_run
+from scipy.spatial.transform import Rotation
+
+from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.witnesses.evidence import Evidence
+from sfm_audit.audit.witnesses.fold import MIN_SCORE, ask_fold, find_fold
+from sfm_audit.audit.witnesses.should_see import should_see
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import (
+    CameraTable,
+    FindingCode,
+    ImageTable,
+    ObservationTable,
+    PointTable,
+    SparseModel,
+)
+
+NUM = 60
+
+
+def sides(seed: int = 0):
+    return np.random.default_rng(seed + 100).permutation(NUM) % 2
+
+
+def ring_model(own_share: float, *, num_points: int = 1500, detected: float = 0.8, seed: int = 0) -> SparseModel:
+    """Cameras on a circle around a cloud; half of them are of another side, and a share of the points of one side."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(NUM) / NUM
+    centre = np.c_[12 * np.cos(angle), 12 * np.sin(angle), np.full(NUM, 1.0)]
+    forward = -centre / np.linalg.norm(centre, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    xyz = rng.normal(0, 1, (num_points, 3))
+    xyz *= 3 / np.linalg.norm(xyz, axis=1, keepdims=True)  # a ball: its far side is hidden
+    side = sides(seed)
+    own = np.where(rng.random(num_points) < own_share, rng.integers(0, 2, num_points), -1)
+    points, xys = [], []
+    for j in range(NUM):
+        facing = ((centre[j] - xyz) * xyz).sum(axis=1) > 0.4 * 12 * 3
+        seen = np.flatnonzero(facing & ((own < 0) | (own == side[j])) & (rng.random(num_points) < detected))
+        cam = (xyz[seen] - centre[j]) @ rotation[j].T
+        xys.append(900 * cam[:, :2] / cam[:, 2:] + [600, 450] + rng.normal(0, 0.3, (len(seen), 2)))
+        points.append(seen)
+    return model_of(rotation, centre, xyz, xys, points)
+
+
+def model_of(rotation, centre, xyz, xys, points) -> SparseModel:
+    """A model of these poses (n, 3, 3), (n, 3), points (p, 3), and per image the observations and their points."""
+    images = [len(seen) for seen in points]
+    return SparseModel(
+        "simulated",
+        "binary",
+        CameraTable(
+            np.array([1], np.uint32),
+            np.array([BY_NAME["SIMPLE_PINHOLE"].model_id]),
+            np.array([1200]),
+            np.array([900]),
+            np.array([900.0, 600, 450]),
+            np.array([0, 3]),
+        ),
+        ImageTable(
+            np.arange(1, NUM + 1, dtype=np.uint32),
+            tuple(f"{j:03d}.jpg" for j in range(NUM)),
+            np.ones(NUM, np.uint32),
+            np.zeros(NUM, np.int64),
+            Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]],
+            -np.einsum("nij,nj->ni", rotation, centre),
+            np.array(images),
+        ),
+        PointTable(np.arange(len(xyz), dtype=np.uint64), xyz, np.full(len(xyz), 0.3)),
+        ObservationTable(
+            np.concatenate([[0], np.cumsum(images)]),
+            np.concatenate([np.arange(n) for n in images]),
+            np.concatenate(xys),
+            np.concatenate(points),
+        ),
+        (),
+    )
+
+
+def evidence(model: SparseModel) -> Evidence:
+    return Evidence(model, model_residuals(model), np.full(len(model.images), 0.3))
+
+
+def test_a_fold_has_its_sides_as_groups_and_is_remarked_on():
+    report = ask_fold(evidence(ring_model(0.5)))
+    groups = np.array(report.columns["fold_group"])
+    assert max(np.mean(groups - 1 == sides()), np.mean(2 - groups == sides())) > 0.9
+    [finding] = report.findings
+    assert finding.code is FindingCode.POSSIBLE_FOLD
+    assert finding.text.startswith("two groups of 3")
+    assert report.columns["fold_score"][0] > MIN_SCORE
+    assert report.witness is None  # a remark: it speaks in no verdict
+
+
+@pytest.mark.parametrize("detected", [0.4, 0.8])
+def test_a_right_model_is_not_remarked_on(detected):
+    report = ask_fold(evidence(ring_model(0.0, detected=detected)))
+    assert report is None or (report.findings == () and report.columns["fold_score"][0] < MIN_SCORE / 2)
+
+
+def test_the_score_is_the_share_of_points_of_one_side():
+    found = find_fold(should_see(*_given(ring_model(0.6, detected=1.0, num_points=4000))))
+    # of the points that either of two images sees: 0.4 + 0.3 within a side, 0.4 of 0.4 + 0.6 across
+    assert found.score == pytest.approx(1 - 0.4, abs=0.05)
+    assert found.mixed == pytest.approx(1.0, abs=0.15)
+
+
+def test_who_should_see_a_point_stands_close_to_one_that_does():
+    model = ring_model(0.0, detected=1.0)
+    seen = should_see(*_given(model))
+    pairs = set(zip(seen.point[seen.sees].tolist(), seen.image[seen.sees].tolist(), strict=True))
+    views = np.bincount(model.observations.point_idx)
+    assert len(pairs) == views[views > 2].sum()
+    others = ~seen.sees
+    assert 0 < others.sum() < 0.5 * len(pairs)  # one image further at either end
+    np.testing.assert_allclose(np.linalg.norm(seen.ray, axis=1), 1.0)
+
+
+def test_small_models_are_not_asked():
+    assert find_fold(should_see(*_given(ring_model(0.5, num_points=300)))) is None
+
+
+def _given(model: SparseModel):
+    return model, model_residuals(model)
+
+
+def test_filter_keeps_one_side(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("os.fsync", lambda _: None)
+    group = np.ma.masked_equal([1, 1, 2, 0], 0)
+    write_run(Path("RUN"), {"a": scene(4, fold_group=group)})
+    assert main(["filter", "RUN", "--keep-group", "1", "--list", "kept.txt"]) == 0
+    assert Path("kept.txt").read_text().split() == ["IMG_0000.jpg", "IMG_0001.jpg", "IMG_0003.jpg"]
+    assert "fold_group: 2" in Path("kept.txt.removed.csv").read_text()
+    write_run(Path("NONE"), {"a": scene(4, fold_group=np.ma.masked_all(4, np.int64))})
+    capsys.readouterr()
+    assert main(["filter", "NONE", "--keep-group", "1", "--list", "none.txt"]) == 2
+    assert "holds no fold_group" in capsys.readouterr().err
