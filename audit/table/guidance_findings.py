@@ -261,7 +261,7 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
     ),
     FindingCode.POSSIBLE_FOLD: Guidance(
         "Opposite sides of a symmetric building put together; day and night; a loop that was not closed.",
-        "Compare with another reconstruction (check --baseline) or ask the database; filter --keep-group keeps one side.",
+        "Compare with another reconstruction (check --baseline) or ask a database; filter --keep-group keeps a side.",
         "That the model is folded: one in five right models of real photos looks so.",
     ),
 }

@@ -5,7 +5,7 @@ apart is seen by one side alone, although images of the other side stand beside 
 other see the same points less often where they are of different sides than where they are of the same one.
 
 The model alone cannot tell that from other reasons to see different points: day and night, a loop that the matcher did
-not close, leaves. So this is a remark with the two groups, no verdict (docs/method.md 13 has its rates).
+not close, leaves. So this is a remark with the two groups, no verdict (docs/witnesses.md has its rates).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import Finding, FindingCode
 
 MIN_IMAGES: Final = 12
-MAX_IMAGES: Final = 4000
+MAX_IMAGES: Final = 2000
 """Pairs of images are held as a full matrix; above that nothing is asked."""
 MIN_POINTS: Final = 500
 MIN_SCORE: Final = 0.15

@@ -103,7 +103,7 @@ def on_side(run: RunReader, images: Sequence[AuditedImage], group: int) -> tuple
         No model of the run has sides.
     """
     if not any(image.fold_group for image in images):
-        advice = "its models are too small, or made by an older version; docs/method.md 13 says what it takes"
+        advice = "its models are too small, or made by an older version; docs/witnesses.md says what it takes"
         raise RunFolderError(run.folder, "holds no fold_group", advice)
     other = 3 - group
     return tuple(
