@@ -28,7 +28,9 @@ def ask_connectivity(evidence: Evidence) -> WitnessReport:
         "covisible_part": parts,
         "is_articulation": cuts.articulation,
     }
-    findings = (*_disconnected(model, parts), *_weakly(model, parts, well.components(), cuts))
+    findings: tuple[Finding, ...] = ()
+    if len(seen.num_shared):  # a model without points is another finding
+        findings = (*_disconnected(model, parts), *_weakly(model, parts, well.components(), cuts))
     return WitnessReport(None, (), columns, findings)
 
 
