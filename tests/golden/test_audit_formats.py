@@ -33,7 +33,7 @@ def test_binary_and_text_give_the_same_tables(tmp_path):
                 assert_allclose(other[column], one[column], rtol=1e-12, atol=1e-12, err_msg=column)
             elif column == "params":
                 assert_allclose(np.stack(other[column]), np.stack(one[column]), rtol=1e-12)
-            elif column not in {"reasons", "reason_details", "misfit_details", "findings"}:
+            elif not isinstance(one[column].dropna().head(1).squeeze(), np.ndarray):
                 assert list(one[column].fillna("")) == list(other[column].fillna("")), column
 
 
