@@ -162,7 +162,10 @@ def place_of(parts: Parts, layout: Layout | None = None) -> Place | None:
     """Return what the model in the folder with these path parts is called; None where ``layout`` does not know it."""
     asked = LAYOUTS.values() if layout is None else (layout,)
     places = ((each.name, each.place(parts)) for each in asked)
-    return next((replace(place, layout=name) for name, place in places if place), None)
+    found = next((replace(place, layout=name) for name, place in places if place), None)
+    if layout is None and found and found.layout == "nerfstudio" and "colmap" not in parts[-3:-1]:
+        return replace(found, layout="colmap")  # a plain sparse/<k> is what COLMAP itself writes; others read it too
+    return found
 
 
 def folders_to_search(parts: Parts, folders: list[str], *, is_model: bool, layout: Layout | None) -> list[str]:
