@@ -28,20 +28,6 @@ _KEPT_ROWS: Final = 20_000  # images of decided models that stay in memory: a pa
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
-class _RejectingCode(click.ParamType[ReasonCode]):
-    """A reason code that can reject."""
-
-    name = "code"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> ReasonCode:
-        """Return the code; a misspelt one is told what it may have meant."""
-        if value in REJECTING_CODES:
-            return ReasonCode(value)
-        close = difflib.get_close_matches(str(value), REJECTING_CODES, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(REJECTING_CODES)}"
-        raise click.BadParameter(f"{value!r} is no reason that rejects; {hint}", ctx, param)
-
-
 @dataclass(frozen=True, slots=True)
 class Again:
     """How a finished run is to be read. policy, min_effect: None for the run's own."""
@@ -91,7 +77,7 @@ def with_again(command: _Command) -> _Command:
             "--reason",
             "reasons",
             metavar="CODE",
-            type=_RejectingCode(),
+            callback=_rejecting_codes,
             multiple=True,
             help="Only rejections for this reason count, others become undetermined. Repeatable.",
         ),
@@ -105,6 +91,16 @@ def with_again(command: _Command) -> _Command:
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _rejecting_codes(context: click.Context, param: click.Parameter, values: tuple[str, ...]) -> tuple[ReasonCode, ...]:
+    """Return the codes; a misspelt one is told what it may have meant."""
+    for value in values:
+        if value not in REJECTING_CODES:
+            close = difflib.get_close_matches(value, REJECTING_CODES, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(REJECTING_CODES)}"
+            raise click.BadParameter(f"{value!r} is no reason that rejects; {hint}", context, param)
+    return tuple(ReasonCode(value) for value in values)
 
 
 def settings_of(run: RunReader) -> AuditConfig:

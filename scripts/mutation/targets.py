@@ -13,7 +13,10 @@ ROUNDS: Final = ("unit/test_joint_rounds.py",)
 NO_SCALE: Final = ("unit/test_keypoint_scale_noise.py::test_too_few_tracks_are_not_fitted",)
 
 TARGETS: Final = (
-    Target("audit/decision/decide.py", (*DECISION, "unit/test_superfluous_parameters.py")),
+    Target(
+        "audit/decision/decide.py",
+        (*DECISION, "unit/test_superfluous_parameters.py", "unit/test_decision_outside.py"),
+    ),
     Target("audit/decision/members.py", DECISION),
     Target(
         "audit/decision/camera.py",

@@ -136,3 +136,36 @@ def test_single_images_are_told_by_advice():
 def test_a_shared_field_without_a_name_is_told_as_that():
     (found,) = triage([image("x", RADIAL)], [camera(material=True, group=None, px=None)], "m")
     assert "no named field 0.00 px" in found.text
+
+
+def test_equally_urgent_ones_stand_by_camera_and_by_advice():
+    of = [camera(1, 2, material=True, advice="RADIAL"), camera(2, 2, material=True, advice="OPENCV")]
+    found = triage([image("b", RADIAL, camera_id=2), image("a", RADIAL, camera_id=1)], of, "m")
+    assert [(each.code, each.camera_id) for each in found] == [("shared_lens", 1), ("shared_lens", 2)]
+    rows = [image("b", RADIAL, advice="RADIAL", camera_id=8), image("a", RADIAL, advice="OPENCV", camera_id=9)]
+    first, second = triage(rows, [], "m")
+    assert ("OPENCV" in first.action, "RADIAL" in second.action) == (True, True)
+
+
+def test_two_images_are_enough_for_a_shared_camera():
+    (found,) = triage([image("a", "camera_not_optimal: f", camera_id=1)], [camera(1, 2)], "m")
+    assert (found.code, found.camera_id) == ("camera_frozen", 1)
+
+
+def test_what_is_no_matter_of_the_camera_is_told_once_whatever_camera_and_advice():
+    of = [camera(1), camera(2)]
+    rows = [image("a", "pose_not_optimal: 1", camera_id=1), image("b", "pose_not_optimal: 1", camera_id=2)]
+    assert [(each.code, each.camera_id, each.num_images) for each in triage(rows, of, "m")] == [
+        ("poses_moved", None, 2)
+    ]
+    rows = [image("a", "noise_differs: 1", advice="RADIAL", group="radial"), image("b", "noise_differs: 1")]
+    (found,) = triage(rows, of, "m")
+    assert (found.num_images, found.text) == (2, DIAGNOSES[DiagnosisCode.NOISE_ONLY].meaning)
+
+
+def test_details_are_those_of_the_diagnosis():
+    (field,) = triage([image("x", "misfit_smooth: 1", group="smooth")], [], "m")
+    assert field.text.endswith(" (smooth 1)")
+    reasons = ("k1_not_identified: 0.1", "camera_not_optimal: f stored 1, implied 2")
+    (frozen,) = triage([image("x", *reasons)], [], "m")
+    assert frozen.text.endswith(": f stored 1, implied 2")
