@@ -11,6 +11,7 @@ of formats that count otherwise exchange the numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 
@@ -40,18 +41,28 @@ class CameraModel:
     @property
     def focal_idxs(self) -> tuple[int, ...]:
         """Rows of the focal lengths, px."""
-        return tuple(i for i, name in enumerate(self.param_names) if name in {"f", "fx", "fy"})
+        return _rows_of(self.param_names)[0]
 
     @property
     def principal_point_idxs(self) -> tuple[int, ...]:
         """Rows of the principal point, px."""
-        return tuple(i for i, name in enumerate(self.param_names) if name in {"cx", "cy"})
+        return _rows_of(self.param_names)[1]
 
     @property
     def extra_idxs(self) -> tuple[int, ...]:
         """Rows of the distortion parameters; empty for EQUIRECTANGULAR, whose parameters are the image size."""
-        known = {"f", "fx", "fy", "cx", "cy", "w", "h"}
-        return tuple(i for i, name in enumerate(self.param_names) if name not in known)
+        return _rows_of(self.param_names)[2]
+
+
+@lru_cache(maxsize=64)
+def _rows_of(names: tuple[str, ...]) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
+    """Rows of focal lengths, principal point and distortion; asked dozens of times for every image."""
+    focals, centre, size = {"f", "fx", "fy"}, {"cx", "cy"}, {"w", "h"}
+    rest = set(names) - focals - centre - size
+    focal, principal_point, extra = (
+        tuple(i for i, name in enumerate(names) if name in chosen) for chosen in (focals, centre, rest)
+    )
+    return focal, principal_point, extra
 
 
 FIRST_OWN_ID: Final = 1000

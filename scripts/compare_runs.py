@@ -32,7 +32,10 @@ def bits(column: pa.ChunkedArray[Any]) -> Sequence[object]:
     if pa.types.is_float64(kind):
         return column.combine_chunks().view(pa.int64()).to_pylist()
     if pa.types.is_list(kind) and pa.types.is_float64(kind.value_type):
-        return [None if row is None else [float.hex(value) for value in row] for row in column.to_pylist()]
+        return [
+            None if row is None else [value if value is None else float.hex(value) for value in row]
+            for row in column.to_pylist()
+        ]
     return column.to_pylist()
 
 

@@ -285,7 +285,7 @@ class ModelAuditor:
         sigma_px = float(self.sigma_constant_px[image_idx])
         return {
             "has_own": has_own,
-            "own": own_diagnostics(step, float(np.median(self.sigma_constant_px[step.image_idxs]))),
+            "own": own_diagnostics(step, step.sigma_px),
             "gains": gains_of(joint, image_idx),
             "camera": joint_camera(camera_diagnostics(quality), quality, step),
             "expected_error_px": expected_error_px(

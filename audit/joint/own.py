@@ -32,6 +32,7 @@ class CameraStep:
     not identified or there is none.
     focal_identified: whether all focal lengths are.
     correlation: (q, q) of the estimates, from the covariance behind ``sd``; NaN where one is not identified.
+    sigma_px: median noise of its images.
     """
 
     camera_idx: int
@@ -48,6 +49,7 @@ class CameraStep:
     focal_identified: bool
     implied: FloatArray
     correlation: FloatArray
+    sigma_px: float
 
     def is_material(self, tau_px: float) -> bool:
         """Whether both steps gain more than tau and a parameter moves by more than 5 sd in both.
@@ -129,6 +131,7 @@ def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -
             system, images, camera.params[params] + step, [params.index(i) for i in camera.model.focal_idxs], step
         ),
         _correlation(covariance, sd),
+        sigma_px,
     )
 
 

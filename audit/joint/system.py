@@ -150,11 +150,13 @@ def _sandwiches(main: SymmetricInverse, meat: sparse.csr_array, blocks: Sequence
 def _batches(blocks: Sequence[IntArray]) -> Iterator[list[IntArray]]:
     """Blocks in turn, a bounded number of columns at once."""
     batch: list[IntArray] = []
+    num_columns = 0
     for block in blocks:
         batch.append(block)
-        if sum(b.size for b in batch) >= _COLUMNS_AT_ONCE:
+        num_columns += block.size
+        if num_columns >= _COLUMNS_AT_ONCE:
             yield batch
-            batch = []
+            batch, num_columns = [], 0
     if batch:
         yield batch
 

@@ -120,16 +120,23 @@ def _durbin_cdf(distance: float, num_values: int) -> float:
     k = math.floor(num_values * distance) + 1
     size = 2 * k - 1
     h = k - num_values * distance
-    row, col = np.indices((size, size))
-    matrix = np.where(row - col + 1 >= 0, 1.0, 0.0)
+    below, factorials = _durbin_shape(size)
+    matrix = below.copy()
     powers = h ** np.arange(1.0, size + 1.0)
     matrix[:, 0] -= powers
     matrix[-1, :] -= powers[::-1]
     matrix[-1, 0] += max(0.0, 2.0 * h - 1.0) ** size
-    matrix /= special.gamma(np.maximum(row - col + 1, 0) + 1.0)
+    matrix /= factorials
     # H / N before the power: entries stay below 1 and above 1e-200 for N < 80.
     power = np.linalg.matrix_power(matrix / num_values, num_values)
     return float(power[k - 1, k - 1] * special.gamma(num_values + 1.0))
+
+
+@lru_cache(maxsize=16)
+def _durbin_shape(size: int) -> tuple[FloatArray, FloatArray]:
+    """(size, size): where Durbin's matrix is not zero, and the factorials that its entries are divided by."""
+    row, col = np.indices((size, size))
+    return np.where(row - col + 1 >= 0, 1.0, 0.0), special.gamma(np.maximum(row - col + 1, 0) + 1.0)
 
 
 def _pelz_good_cdf(x: float, num_values: int) -> float:

@@ -46,6 +46,7 @@ def camera_step(step=(10.0, 0.1), plain=(12.0, 0.2), sd=(1.0, 1.0), px=(0.3, 0.4
         focal_identified=True,
         implied=stored + np.array(step),
         correlation=np.eye(2),
+        sigma_px=0.5,
     )
 
 

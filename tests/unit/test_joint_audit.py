@@ -121,6 +121,7 @@ def test_a_step_is_material_if_both_say_so(changes, material):
         focal_identified=True,
         implied=np.array([1050.0, 0.0]),
         correlation=np.eye(2),
+        sigma_px=0.5,
     )
     assert dataclasses.replace(step, **changes).is_material(0.2) is material
 
