@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
-from sfm_audit.audit.joint.observations import design_crossed, design_scores
+from sfm_audit.audit.joint.observations import JointObservations, design_crossed, design_scores
 from sfm_audit.audit.joint.system import Base, IncludedFields
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -47,14 +47,30 @@ class CandidateScores:
         )
 
 
+AT_ONCE: Final = 2**15
+"""Observations of an image, or points, whose fields are in memory at the same time."""
+
+
 class ImageFields(NamedTuple):
     """Candidate fields (n_i, 2, c) px per unit of one image beside its nuisance columns (n_i, 2, C)."""
 
     fields: FloatArray
     nuisance: FloatArray
 
+    def part(self, chosen: slice | IntArray) -> ImageFields:
+        """Those of some of the observations."""
+        return ImageFields(self.fields[chosen], self.nuisance[chosen])
 
-def candidate_scores(base: Base, images: Sequence[int], fields_of: Callable[[int], ImageFields]) -> CandidateScores:
+
+class FieldsInParts(NamedTuple):
+    """The same, calculated when asked for: a million points have 800 MB of fields."""
+
+    part: Callable[[slice | IntArray], ImageFields]
+
+
+def candidate_scores(
+    base: Base, images: Sequence[int], fields_of: Callable[[int], ImageFields | FieldsInParts]
+) -> CandidateScores:
     """Project candidate fields off the base and correlate them with what it leaves.
 
     Parameters
@@ -67,28 +83,33 @@ def candidate_scores(base: Base, images: Sequence[int], fields_of: Callable[[int
     y~ is orthogonal to J track by track and to N as a whole, so E~ itself is not needed:
     R = N^T E - W V^-1 J^T E,  B = S^+ R,  K = E^T E - (J^T E)^T V^-1 (J^T E) - R^T B,  u = E^T y~,
     G_t = sum over own views of E^T y~ - sum over all views k of the track of B_k^T N_k^T y~_k.
+
+    Fields of 32,768 points at once: a single image with more goes through all of it in parts, of several images only
+    their own sums do. Sums are in the order of points, whatever the machine.
     """
     observations = base.observations
     points = _points_of(base, images)
-    chunks = [(part, neighbourhood(observations, points[part])) for part in point_chunks(observations, points)]
-    coupling = _Coupling(base, [around.images for _, around in chunks])
+    parts = _parts(points.size) if len(images) == 1 else [slice(0, points.size)]
+    chunks = [chunk for part in parts for chunk in _chunks(observations, points, part)]
+    coupling = _Coupling(base, [around.images for _, _, around in chunks])
     sums = _OwnSums(base, points, coupling)
-    for image in images:
-        sums.add(image, fields_of(image))
-    crossed, right, gram, track_score = sums.crossed, sums.right, sums.gram, sums.track_score
-    sq_length, count = gram.diagonal().copy(), len(gram)
-    absorbed = base.point_inverse[points] @ crossed
-    gram -= crossed.reshape(-1, count).T @ absorbed.reshape(-1, count)
     view_scores: list[FloatArray | None] = []
-    if not observations.points_independent:
-        for part, around in chunks:
-            view_scores.append(coupling.subtract_tracks(right, around, absorbed[part], keep=len(chunks) == 1))
+    for part in parts:
+        absorbed = sums.add(part, images, fields_of, in_parts=len(parts) > 1)
+        for within, own, around in chunks:
+            if within is part and not observations.points_independent:
+                keep = len(chunks) == 1
+                view_scores.append(coupling.subtract_tracks(sums.right, around, absorbed[own], keep=keep))
+    right, gram, track_score = sums.right, sums.gram, sums.track_score
+    sq_length, count = gram.diagonal().copy(), len(gram)
+    for gone in sums.eliminated:
+        gram -= gone
     solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
     score = track_score.sum(axis=0)
     padded = np.vstack([solution, np.zeros((1, count))])
-    for (part, around), known in zip_longest(chunks, view_scores):
-        track_score[part] -= coupling.scores(around, padded, known)
+    for (part, own, around), known in zip_longest(chunks, view_scores):
+        track_score[part][own] -= coupling.scores(around, padded, known)
     num_observations = sum(observations.num_of(image) for image in images)
     gram = 0.5 * (gram + gram.T)
     return CandidateScores(
@@ -107,35 +128,74 @@ def _points_of(base: Base, images: Sequence[int]) -> IntArray:
     return np.flatnonzero(seen)
 
 
+def _parts(size: int) -> list[slice]:
+    return [slice(start, min(start + AT_ONCE, size)) for start in range(0, size, AT_ONCE)]
+
+
+def _chunks(
+    observations: JointObservations, points: IntArray, part: slice
+) -> Iterator[tuple[slice, slice, Neighbourhood]]:
+    """A part of the points, which of them, and who sees these."""
+    for own in point_chunks(observations, points[part]):
+        yield part, own, neighbourhood(observations, points[part][own])
+
+
 class _OwnSums:
     """What the images' own observations add up to, image by image.
 
-    gram: (c, c) E^T E.    crossed: (T, 3, c) J^T E.    track_score: (T, c) E^T y~.    right: (s + 1, c) N^T E.
+    gram: (c, c) E^T E.    track_score: (T, c) E^T y~.    right: (s + 1, c) N^T E.
+    eliminated: (c, c) (J^T E)^T V^-1 (J^T E) of each part of the points.
     """
 
     def __init__(self, base: Base, points: IntArray, coupling: _Coupling) -> None:
         self._base, self._points, self._coupling = base, points, coupling
-        self.gram = np.zeros((0, 0))
-        self.crossed = self.track_score = self.right = np.zeros((0, 0))
+        self.gram = self.right = self.track_score = np.zeros((0, 0))
+        self.eliminated: list[FloatArray] = []
 
-    def add(self, image: int, own: ImageFields) -> None:
-        """Add one image."""
+    def add(
+        self,
+        part: slice,
+        images: Sequence[int],
+        fields_of: Callable[[int], ImageFields | FieldsInParts],
+        *,
+        in_parts: bool,
+    ) -> FloatArray:
+        """Add what the images see of a part of the points; return (T, 3, c) V^-1 J^T E of these points."""
+        crossed = np.zeros((0, 0, 0))
+        for image in images:
+            fields = fields_of(image)
+            for chosen in self._chosen(image, part) if in_parts else _parts(self._base.observations.num_of(image)):
+                own = fields.part(chosen)
+                if not crossed.size:
+                    crossed = np.zeros((part.stop - part.start, 3, own.fields.shape[2]))
+                self._add(image, own, chosen, part, crossed)
+        absorbed = self._base.point_inverse[self._points[part]] @ crossed
+        count = crossed.shape[2]
+        self.eliminated.append(crossed.reshape(-1, count).T @ absorbed.reshape(-1, count))
+        return np.asarray(absorbed)
+
+    def _chosen(self, image: int, part: slice) -> list[IntArray]:
+        """Observations of an image that show a part of the points."""
+        point_idx = self._base.observations.point_idx[self._base.observations.rows(image)]
+        first, last = self._points[part.start], self._points[part.stop - 1]
+        return [np.flatnonzero((point_idx >= first) & (point_idx <= last))]
+
+    def _add(self, image: int, own: ImageFields, chosen: slice | IntArray, part: slice, crossed: FloatArray) -> None:
         observations = self._base.observations
         rows, count = observations.rows(image), own.fields.shape[2]
-        weighted = own.fields * observations.weight[rows, None, None]
+        weighted = own.fields * observations.weight[rows][chosen, None, None]
         flat = weighted.reshape(-1, count)
-        crossed = observations.jacobian(image).transpose(0, 2, 1) @ weighted
-        track_score = np.einsum("nac,na->nc", weighted, self._base.left_px[rows])
         if not self.gram.size:
-            num_tracks = self._points.size
             self.gram, self.right = np.zeros((count, count)), self._coupling.zeros(count)
-            self.crossed, self.track_score = np.zeros((num_tracks, 3, count)), np.zeros((num_tracks, count))
-        seen, track = np.unique(observations.point_idx[rows], return_inverse=True)
-        at = np.searchsorted(self._points, seen)
-        self.crossed[at] += sum_by_track(crossed, track, seen.size)
-        self.track_score[at] += sum_by_track(track_score, track, seen.size)
+            self.track_score = np.zeros((self._points.size, count))
+        seen, track = np.unique(observations.point_idx[rows][chosen], return_inverse=True)
+        at = np.searchsorted(self._points[part], seen)
+        own_crossed = observations.jacobian(image)[chosen].transpose(0, 2, 1) @ weighted
+        crossed[at] += sum_by_track(own_crossed, track, seen.size)
+        track_score = np.einsum("nac,na->nc", weighted, self._base.left_px[rows][chosen])
+        self.track_score[part][at] += sum_by_track(track_score, track, seen.size)
         self.gram += flat.T @ own.fields.reshape(-1, count)
-        self._coupling.add_own(self.right, image, own.nuisance, flat)
+        self._coupling.add_own(self.right, image, own.nuisance, flat, chosen)
 
 
 class _Coupling:
@@ -165,13 +225,15 @@ class _Coupling:
         """R before anything was added, (s + 1, c)."""
         return np.zeros((self.support.size + 1, count))
 
-    def add_own(self, right: FloatArray, image: int, nuisance: FloatArray, weighted: FloatArray) -> None:
-        """Add N^T E of one image, in place; ``weighted`` (2 n_i, c) is w E."""
+    def add_own(
+        self, right: FloatArray, image: int, nuisance: FloatArray, weighted: FloatArray, chosen: slice | IntArray
+    ) -> None:
+        """Add N^T E of one image, in place; ``weighted`` (2 n_i, c) is w E of the chosen observations."""
         own = nuisance.reshape(len(weighted), -1)
         np.add.at(right, self._places(image), own.T @ weighted)
         extra = self._base.included.get(image)
         if extra is not None:
-            right[self._place[extra.columns]] += extra.fields.reshape(len(weighted), -1).T @ weighted
+            right[self._place[extra.columns]] += extra.fields[chosen].reshape(len(weighted), -1).T @ weighted
 
     def subtract_tracks(
         self, right: FloatArray, around: Neighbourhood, absorbed: FloatArray, *, keep: bool

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_audit.audit.cameras.functions import Term
 from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.audit.inliers.projected import ProjectedImage
-from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.own import CameraStep
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
@@ -147,12 +147,12 @@ def _asked_of(system: JointSystem, step: CameraStep) -> _Asked:
     return _Asked(images, camera, step.camera_idx, step.sd_focal_rel)
 
 
-def _missing_fields(system: JointSystem, image: int) -> ImageFields:
+def _missing_fields(system: JointSystem, image: int, chosen: slice | IntArray) -> ImageFields:
     """Six columns, px per unit: principal point (px), next radial term, aspect (relative), tangential p1, p2."""
-    inliers = system.observations.inliers(image)
+    inliers = system.observations.inliers(image, chosen)
     camera, projected = inliers.camera, inliers.projected
     out = _missing_columns(camera, projected, candidate_fields(camera, projected))
-    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image))
+    return ImageFields(np.ascontiguousarray(out.transpose(2, 1, 0)), system.observations.nuisance(image, chosen))
 
 
 def _missing_columns(camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray) -> FloatArray:
@@ -165,10 +165,10 @@ def _missing_columns(camera: CameraRecord, projected: ProjectedImage, candidates
     return out
 
 
-def _shift_fields(system: JointSystem, image: int) -> ImageFields:
+def _shift_fields(system: JointSystem, image: int, chosen: slice | IntArray) -> ImageFields:
     """The two columns of the principal point, px."""
-    shift = np.tile(np.eye(2), (system.observations.num_of(image), 1, 1))
-    return ImageFields(shift, system.observations.nuisance(image))
+    nuisance = system.observations.nuisance(image, chosen)
+    return ImageFields(np.tile(np.eye(2), (len(nuisance), 1, 1)), nuisance)
 
 
 def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
@@ -196,7 +196,11 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
 
 def _of_images(system: JointSystem, asked: _Asked) -> list[ImpliedParameter]:
     images = asked.images[np.diff(system.observations.offsets)[asked.images] > 0]
-    fields_of = partial(_missing_fields if asked.camera_idx is not None else _shift_fields, system)
+    columns = _missing_fields if asked.camera_idx is not None else _shift_fields
+
+    def fields_of(image: int) -> FieldsInParts:
+        return FieldsInParts(partial(columns, system, image))
+
     return _implied(system, asked._replace(images=images), candidate_scores(system.base, images.tolist(), fields_of))
 
 

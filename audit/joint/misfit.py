@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
 from sfm_audit.audit.inliers.projected import ProjectedImage
-from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.candidates import AT_ONCE, CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
 from sfm_audit.audit.joint.inclusion import Candidate, include
+from sfm_audit.audit.joint.observations import EVERY
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
-from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
 
 MAX_ROUNDS: Final = 8
@@ -117,12 +119,13 @@ def joint_misfit(
     if 2 * np.count_nonzero(left_out) > np.count_nonzero(has_columns):
         left_out = np.zeros_like(has_columns)
     rounds = _Rounds(system, has_columns & ~left_out, alpha=alpha, tau_px=tau_px, beside=beside)
-    rounds.tests = [_nothing(has_columns[i], left_out[i]) for i in range(len(has_columns))]
+    nothing = {out: _nothing(out) for out in (False, True)}
+    rounds.tests = [nothing[out] for out in (has_columns & left_out).tolist()]
     return rounds.run()
 
 
-def _nothing(has_columns: bool, left_out: bool) -> dict[MisfitGroup, GroupTest]:
-    status = MisfitStatus.EXCLUDED if has_columns and left_out else MisfitStatus.NO_COLUMNS
+def _nothing(left_out: bool) -> dict[MisfitGroup, GroupTest]:
+    status = MisfitStatus.EXCLUDED if left_out else MisfitStatus.NO_COLUMNS
     return dict.fromkeys(GROUPS, untested(status))
 
 
@@ -138,7 +141,7 @@ class _Rounds:
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
         self.tests: list[dict[MisfitGroup, GroupTest]] = []
-        self._worth: list[dict[MisfitGroup, Worth]] = [{} for _ in range(num_images)]
+        self._worth: list[dict[MisfitGroup, Worth]] = [{}] * num_images
         self._q = np.full((num_images, len(GROUPS)), np.nan)
         self._round = np.full(num_images, -1)
 
@@ -166,8 +169,14 @@ class _Rounds:
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
 
     def _scores(self, image: int) -> CandidateScores | None:
-        fields = _fields_of(self._system, image, self._beside)
-        if not fields.fields.size:
+        fields: ImageFields | FieldsInParts
+        if self._system.observations.num_of(image) <= AT_ONCE:
+            fields = _fields_of(self._system, image, self._beside)
+            is_empty = not fields.fields.size
+        else:
+            fields = FieldsInParts(partial(_fields_of, self._system, image, self._beside))
+            is_empty = not fields.part(slice(1)).fields.size
+        if is_empty:
             return None
         scores = candidate_scores(self._base, [image], lambda _: fields)
         if self._beside is None:
@@ -180,12 +189,10 @@ class _Rounds:
 
     def _effects(self) -> FloatArray:
         """(I,) largest effect among significant groups."""
-        return np.array(
-            [
-                max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
-                for i in range(len(self.tests))
-            ]
-        )
+        out = np.zeros(len(self.tests))  # nothing is significant where nothing was tested
+        for i in np.flatnonzero(self._tested).tolist():
+            out[i] = max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
+        return out
 
     def _include(self, new: BoolArray) -> None:
         candidates = []
@@ -211,17 +218,26 @@ class _Rounds:
     def _result(self, most: bool) -> JointMisfit:
         tests: list[JointTests] = []
         causes: list[MisfitGroup | None] = []
-        for image, own in enumerate(self.tests):
-            q = self._q[image].tolist()
-            worth = self._worth[image]
-            joint = {
-                group: JointTest(t.p, q[k], t.px, t.rank, t.status, t.gain, worth.get(group, NO_WORTH))
-                for k, (group, t) in enumerate(own.items())
-            }
-            tests.append(joint)
-            causes.append(self._cause(image, joint))
+        untested: dict[MisfitStatus, JointTests] = {}  # of a large model's blocks nearly all images are
+        for image, is_tested in enumerate(self._tested.tolist()):
+            if is_tested:
+                tests.append(self._joint_tests(image))
+                causes.append(self._cause(image, tests[-1]))
+                continue
+            status = self.tests[image][GROUPS[0]].status
+            if status not in untested:
+                untested[status] = self._joint_tests(image)
+            tests.append(untested[status])
+            causes.append(None)
         effect = np.where(self._tested, self._effects(), np.nan)
         return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
+
+    def _joint_tests(self, image: int) -> JointTests:
+        q, worth = self._q[image].tolist(), self._worth[image]
+        return {
+            group: JointTest(t.p, q[k], t.px, t.rank, t.status, t.gain, worth.get(group, NO_WORTH))
+            for k, (group, t) in enumerate(self.tests[image].items())
+        }
 
     def _cause(self, image: int, tests: JointTests) -> MisfitGroup | None:
         significant = self._significant(image)
@@ -230,15 +246,17 @@ class _Rounds:
         return max(material or significant, key=lambda group: tests[group].bic(n), default=None)
 
 
-def _fields_of(system: JointSystem, image: int, beside: Beside | None = None) -> ImageFields:
+def _fields_of(
+    system: JointSystem, image: int, beside: Beside | None = None, chosen: slice | IntArray = EVERY
+) -> ImageFields:
     """42 candidate fields of an image, px per unit, and those of ``beside``; none of panoramas."""
-    inliers = system.observations.inliers(image)
+    inliers = system.observations.inliers(image, chosen)
     camera, projected = inliers.camera, inliers.projected
     candidates = candidate_fields(camera, projected)
     if beside is not None and len(candidates):
         candidates = np.concatenate([candidates, beside.fields(image, camera, projected, candidates)])
     fields = np.ascontiguousarray(candidates.transpose(2, 1, 0))
-    return ImageFields(fields, system.observations.nuisance(image))
+    return ImageFields(fields, system.observations.nuisance(image, chosen))
 
 
 def _image_tests(

@@ -14,6 +14,7 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 MIN_INLIERS: Final = 20
+EVERY: Final = slice(None)
 _POINT: Final = slice(3, 6)  # columns of J in the design
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
 _SINGULAR_POINT: Final = 1e-9  # determinant of V with unit diagonal
@@ -78,9 +79,9 @@ class JointObservations:
         """J (n_i, 2, 3) of an image, px per model unit, world frame."""
         return self.design[self.rows(image_idx), :, _POINT]
 
-    def nuisance(self, image_idx: int) -> FloatArray:
-        """N (n_i, 2, C) of an image, px per unit of its columns."""
-        return np.asarray(self.design[self.rows(image_idx)] @ self.transform[image_idx])
+    def nuisance(self, image_idx: int, chosen: slice | IntArray = EVERY) -> FloatArray:
+        """N (n_i, 2, C) of an image, or of some of its observations, px per unit of its columns."""
+        return np.asarray(self.design[self.rows(image_idx)][chosen] @ self.transform[image_idx])
 
     def weighted(self, views: IntArray | slice) -> tuple[FloatArray, FloatArray]:
         """Return (v, 2, C) the design of some observations, and (v,) their weights."""
@@ -96,10 +97,10 @@ class JointObservations:
         """(n,) 1 / s^2, 1 / px^2."""
         return np.repeat(self.sigma_px, np.diff(self.offsets)) ** -2.0
 
-    def inliers(self, image_idx: int) -> ImageInliers:
-        """The observations of an image that are in the system."""
-        chosen = self.source[self.rows(image_idx)] - self.residuals.offsets[image_idx]
-        return image_inliers(self.model, self.residuals, image_idx, chosen)
+    def inliers(self, image_idx: int, chosen: slice | IntArray = EVERY) -> ImageInliers:
+        """The observations of an image that are in the system, or some of them."""
+        source = self.source[self.rows(image_idx)][chosen] - self.residuals.offsets[image_idx]
+        return image_inliers(self.model, self.residuals, image_idx, source)
 
 
 def joint_observations(

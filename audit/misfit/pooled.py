@@ -234,6 +234,7 @@ def _first_pass(
             return MisfitStatus.NOT_FINITE
         sums = sums or _Sums(len(design.intrinsics), num_tracks)
         sums.add(part, design.track)
+        del design, part  # before the next image's columns are made
     if sums is None:
         return MisfitStatus.NOT_ENOUGH_EVIDENCE
     return sums.normal() if np.isfinite(sums.before).all() else MisfitStatus.NOT_FINITE
@@ -316,15 +317,18 @@ def _second_pass(
         part = _off_pose(design) if len(design.track) else None
         if part is None:
             continue
+        track = design.track
+        del design
         part.columns[...] *= normal.scale[:, None]
         qc = solution.to_basis.T @ part.columns[:k]
-        fields = part.columns[k:] - solution.on_basis.T @ qc
+        fields = part.columns[k:]
+        fields -= solution.on_basis.T @ qc
         y = part.y - on_basis_y @ qc
         leverage = np.minimum(part.pose_leverage + np.einsum("qm,qm->m", qc, qc), basis.MAX_LEVERAGE)
         weighted = (y / np.sqrt(1.0 - leverage)).reshape(2, -1)
-        g = np.einsum("cin,in->nc", fields.reshape(num_fields, 2, -1), weighted)
-        _add_rows(per_track, design.track, g, last_row)
         scores += fields @ y
+        _add_rows(per_track, track, np.einsum("cin,in->nc", fields.reshape(num_fields, 2, -1), weighted), last_row)
+        del part, fields  # before the next image's columns are made
     meat = per_track.T @ per_track
     tests = {group: _judged(group, scores, meat, normal, solution) for group in GROUPS}
     return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,8 +13,16 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.audit.joint import image_from_frame, image_gains, joint_misfit, joint_system, own_parameters
-from sfm_audit.audit.joint.candidates import ImageFields, candidate_scores
+from sfm_audit.audit.joint import (
+    candidates,
+    image_from_frame,
+    image_gains,
+    joint_misfit,
+    joint_system,
+    misfit,
+    own_parameters,
+)
+from sfm_audit.audit.joint.candidates import FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.group_test import test_group as judge_group
 from sfm_audit.audit.joint.inclusion import Candidate, include
@@ -111,6 +120,34 @@ def test_sandwich_is_clustered_by_track(system, reference, model):
         by_track = np.zeros((len(own), len(model.points)))
         np.add.at(by_track.T, np.repeat(reference.point, 2), own.T)
         assert_allclose(camera.sd, np.sqrt((by_track**2).sum(axis=1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("images", [[2], [0, 2, 3]])
+def test_candidates_in_parts_are_those_of_all_points_at_once(system, images, monkeypatch):
+    whole = candidate_scores(system.base, images, lambda image: fields_of(system, image))
+    monkeypatch.setattr(candidates, "AT_ONCE", 7)
+    asked = []
+
+    def part(image, chosen):
+        asked.append(chosen)
+        return fields_of(system, image).part(chosen)
+
+    parts = candidate_scores(system.base, images, lambda image: FieldsInParts(partial(part, image)))
+    assert len(asked) > 3 * len(images)
+    for name in ("sq_length", "gram", "score", "track_score", "coupling"):
+        found, expected = getattr(parts, name), getattr(whole, name)
+        assert_allclose(found, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max(), err_msg=name)
+
+
+def test_a_large_image_is_tested_in_parts(system, monkeypatch):
+    tau = np.full(len(system.model.images), 0.2)
+    whole = joint_misfit(system, alpha=0.01, tau_px=tau)
+    for module in (candidates, misfit):
+        monkeypatch.setattr(module, "AT_ONCE", 7)
+    parts = joint_misfit(system, alpha=0.01, tau_px=tau)
+    for found, expected in zip(parts.tests, whole.tests, strict=True):
+        assert [test.status for test in found.values()] == [test.status for test in expected.values()]
+        assert_allclose([t.px for t in found.values()], [t.px for t in expected.values()], rtol=1e-6, atol=1e-6)
 
 
 def test_candidates_are_the_fields_projected_off_everything(system, reference):
