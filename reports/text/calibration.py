@@ -9,6 +9,7 @@ from typing import Any, Final
 from sfm_audit.audit.table.words import is_remark
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
+from sfm_audit.reports.text.legend import level_words
 from sfm_audit.reports.text.summary import SHORT_GROUP, VERDICT_STYLE
 from sfm_audit.reports.text.wording import MISSING, counted, number, paragraph, plain, probability, px
 
@@ -49,8 +50,8 @@ def render_calibration(rows: Sequence[Row], settings: Mapping[str, Any], page: P
 def _heading(row: Row, found: Sequence[Row], settings: Mapping[str, Any], width: int) -> str:
     what = f"{plain(row['correspondences'])}: {counted(row['num_correspondences'], 'correspondence')}"
     noise = _NOISE_WORDS[found[0]["noise_model"]] if found else "no camera found"
-    said = f"{what}, image of {row['width']} x {row['height']} px; {noise}, alpha {settings['alpha']:g}"
-    return paragraph(f"{said}, min effect {settings['min_effect']}, policy {settings['policy']}", width, "  ")
+    said = f"{what}, image of {row['width']} x {row['height']} px; {noise}"
+    return paragraph(f"{said}; judged by policy {settings['policy']}; {level_words(settings)}", width, "  ")
 
 
 def _camera_fields() -> list[Field]:

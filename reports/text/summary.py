@@ -14,6 +14,7 @@ from typing import Any, Final
 from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICY_WORDS, SEVERITY_ORDER, VERDICT_ORDER, Member, Verdict
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.drawing import Field, Listing, Page, draw
+from sfm_audit.reports.text.legend import legend, settings_words
 from sfm_audit.reports.text.reasons import reasons_part
 from sfm_audit.reports.text.triage import MAX_DIAGNOSES, triage_part, urgency
 from sfm_audit.reports.text.witnesses import witnesses_line
@@ -157,7 +158,7 @@ def render_summary(run: RunReader, page: Page) -> str:
     """
     models = _Models.read(run.rows("models", MODEL_COLUMNS))
     parts = [
-        paragraph(_heading(run), page.width, "  "),
+        paragraph(_heading(run, models), page.width, "  "),
         *_models_part(models, page),
         *_verdicts_part(run, models, page),
         *_images_part(run, models, page),
@@ -176,10 +177,8 @@ def _where(models: _Models) -> Callable[[Row], str] | None:
     return None if models.num_models == 1 else lambda row: _model_name(row, several=models.several)
 
 
-def _heading(run: RunReader) -> str:
-    config = run.info["config"]
-    settings = {"noise": "noise", "points": "points", "policy": "policy", "alpha": "alpha", "min_effect": "min effect"}
-    said = ", ".join(f"{words} {config.get(name)}" for name, words in settings.items())
+def _heading(run: RunReader, models: _Models) -> str:
+    said = settings_words(run.info["config"], has_witnesses=bool(models.witnesses))
     again = f"; decided again: {run.info['decided_again']}" if run.info.get("decided_again") else ""
     return f"sfm-audit {run.info['version']}: {said}{again}"
 
@@ -260,7 +259,7 @@ def _images_part(run: RunReader, models: _Models, page: Page) -> list[str]:
     text = draw(listing, fields, page)
     if len(rows) < total:
         text += f"... and {total - len(rows)} more, see {plain(str(run.folder))}/images\n"
-    return [text, *reasons_part(run, page.width)]
+    return [text, legend(page.width, has_coverage="cover-" in text), *reasons_part(run, page.width)]
 
 
 def _cameras_part(run: RunReader, models: _Models, page: Page) -> list[str]:

@@ -14,6 +14,7 @@ from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.store import RunStore
 from sfm_audit.reports.text.drawing import Page
+from sfm_audit.reports.text.legend import legend, settings_words
 from sfm_audit.reports.text.summary import CAVEATS, MAX_IMAGES_OF_ONE, MAX_MODELS, render_summary
 from sfm_audit.reports.text.wording import natural_key, number, plain, probability, px, shorten
 
@@ -320,3 +321,38 @@ def test_models_are_shown_in_the_order_of_their_names_whatever_the_order_of_the_
     places = [page.index(f"{i:04d}/0") for i in range(MAX_MODELS)]
     assert places == sorted(places)
     assert f"{FINDING.code} 0001/0: {FINDING.text} (and in 38 other models)" in " ".join(page.split())
+
+
+STANDARD = {"policy": "standard", "alpha": 0.05, "min_effect": "0.2px", "noise": "track", "points": "in-sample"}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            {},
+            "policy standard: lens, camera, pose, plausibility, noise; 5% level; effects below 0.2 px ignored; noise",
+        ),
+        ({"min_effect": "0.5sigma", "alpha": 0.001}, "0.1% level; effects below 0.5 sigma (the noise of the image)"),
+        ({"policy": "paper"}, "policy paper: distribution of the noise (KS); 5% level; noise predicted"),
+        ({"noise": "constant", "points": "independent"}, "one noise level per image; 3D points measured independently"),
+        ({"policy": "of later", "alpha": None}, "policy of later; level None; noise predicted"),
+    ],
+)
+def test_the_first_lines_say_what_judged_the_images(given, said):
+    assert said in settings_words({**STANDARD, **given}, has_witnesses=False)
+
+
+def test_witnesses_are_named_where_some_were_asked():
+    assert "noise, witnesses outside; 5%" in settings_words(STANDARD, has_witnesses=True)
+
+
+def test_a_legend_of_four_lines_stands_under_the_tables(run_folder):
+    text = render_summary(make_run(run_folder, 1, 5), Page(80))
+    assert text.startswith("sfm-audit ")
+    assert "each image judged by policy" in " ".join(text.split())
+    lines = section(text, "error: mean reprojection error").splitlines()
+    assert len(lines) == 4
+    assert lines[-1].endswith("docs/glossary.md")
+    assert "coverage:" in " ".join(lines)
+    assert "coverage:" not in legend(80, has_coverage=False)
