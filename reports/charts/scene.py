@@ -7,7 +7,7 @@ up; where none is near, it is theirs, and where they do not agree on one, the sh
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ _HEIGHTS: Final = (150.0, 460.0)
 _EDGE: Final = 12.0
 _MIN_AGREEMENT: Final = 0.3  # length of the mean of the cameras' unit vectors up
 _NEAR_UP: Final = 0.9  # cosine: a principal axis this near to the cameras' up is up, else theirs is
+_MAX_PLACE: Final = 1e100  # model units
 _FAR_OUT: Final = 1.5  # times the extent of the bulk, beyond which a camera is drawn at the border
 
 
@@ -68,6 +69,7 @@ class Placed:
 
 def place(view: SceneView) -> Placed:
     """Return where cameras and points stand in the top and in the side view; both share the horizontal axis."""
+    view = _drawable(view)
     axes = principal_axes(view)
     cameras, points, ahead = (values @ axes.T for values in (view.centre, view.points, view.ahead))
     low, high, outside = _bounds(cameras, points)
@@ -95,6 +97,13 @@ def place(view: SceneView) -> Placed:
         ahead[:, [0, 2]] * [1.0, -1.0],
         outside,
     )
+
+
+def _drawable(view: SceneView) -> SceneView:
+    """Return the view without places that are finite and whose squares are not: cameras unknown, points left out."""
+    known = (np.abs(view.points) <= _MAX_PLACE).all(axis=1)
+    centre = np.where((np.abs(view.centre) <= _MAX_PLACE).all(axis=1)[:, None], view.centre, np.nan)
+    return replace(view, points=view.points[known], centre=centre)
 
 
 def principal_axes(view: SceneView) -> FloatArray:

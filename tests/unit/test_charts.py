@@ -234,3 +234,14 @@ def test_the_strongest_pairs_are_the_strongest_of_either_image():
     view = SceneView(np.arange(4), *(np.zeros((4, 3)) for _ in range(4)), pairs, shared)
     assert strongest_pairs(view, 1).tolist() == [[0, 1], [0, 2], [2, 3]]
     assert strongest_pairs(view, 3).tolist() == pairs.tolist()
+
+
+def test_places_whose_squares_are_not_finite_are_not_drawn():
+    view = ring()
+    points, centre = view.points.copy(), view.centre.copy()
+    points[3, 1], centre[2, 0] = 1e300, -1.7e308
+    odd = SceneView(view.image_id, centre, view.ahead, view.up, points, view.pairs, view.shared)
+    placed = place(odd)
+    assert len(placed.points_top) < len(view.points)
+    assert np.isnan(placed.top[2]).all()
+    assert np.isfinite(np.delete(placed.top, 2, axis=0)).all()
