@@ -102,7 +102,8 @@ def place(view: SceneView) -> Placed:
 def _drawable(view: SceneView) -> SceneView:
     """Return the view without places that are finite and whose squares are not: cameras unknown, points left out."""
     known = (np.abs(view.points) <= _MAX_PLACE).all(axis=1)
-    centre = np.where((np.abs(view.centre) <= _MAX_PLACE).all(axis=1)[:, None], view.centre, np.nan)
+    centre = view.centre.copy()
+    centre[(np.abs(centre) > _MAX_PLACE).any(axis=1)] = np.nan
     return replace(view, points=view.points[known], centre=centre)
 
 
