@@ -19,6 +19,7 @@ from sfm_audit.reports.html.content import MAX_CAMERAS, MAX_SCENES, Reason, RunC
 from sfm_audit.reports.html.payload import Places, camera_title, payload
 from sfm_audit.reports.html.pictures import ImagePictures, Picture
 from sfm_audit.reports.html.scenes import ModelView, draw_view
+from sfm_audit.reports.html.todo import codes_of, diagnoses_of
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.explain import LIMITS, plain_reason
 from sfm_audit.reports.text.reasons import reasons_of
@@ -49,6 +50,8 @@ def render_page(page: PageInput) -> str:
     places = Places.of(content)
     views = [draw_view(view, content.rows) for view in page.views]
     worst = content.rows[: len(page.pictures)]
+    diagnoses, num_diagnoses = diagnoses_of(content)
+    codes = codes_of(content)
     return (
         environment()
         .get_template("report.html.j2")
@@ -75,6 +78,10 @@ def render_page(page: PageInput) -> str:
             worst=[_worst(i, row, page.pictures[i]) for i, row in enumerate(worst)],
             no_photos=page.no_photos,
             num_rows=len(content.rows),
+            diagnoses=diagnoses,
+            num_diagnoses=num_diagnoses,
+            codes=codes,
+            explained={f"{section.kind}-{section.code}" for section in codes},
             findings=_findings(content),
             failures=[plain(item["message"]) for item in info.get("failures", [])],
             limits=(*LIMITS, _witnesses(content)),
@@ -293,9 +300,9 @@ def _worst(index: int, row: Row, pictures: ImagePictures) -> dict[str, Any]:
     }
 
 
-def _findings(content: RunContent) -> list[tuple[str, str]]:
+def _findings(content: RunContent) -> list[tuple[str, str, str]]:
     return [
-        (plain(f"{row['scene']}/{row['component']}"), plain(finding["text"]))
+        (plain(f"{row['scene']}/{row['component']}"), plain(str(finding["code"])), plain(finding["text"]))
         for row in content.models
         for finding in row["findings"] or []
     ][:MAX_SCENES]

@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image
 from report_samples import NASTY_NAMES, read_sample
+from run_samples import STATE, make_ref, sample_tables, settings
 
+from sfm_audit.audit.table.diagnoses import Diagnosis, DiagnosisCode
 from sfm_audit.audit.table.words import strongest
+from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.reports import html
 from sfm_audit.reports.charts import Residuals
 from sfm_audit.reports.charts.sensor import residual_vectors
 from sfm_audit.reports.html.photos import find_photo, photo_urls
+from sfm_audit.reports.run_folder.reader import RunReader
+from sfm_audit.reports.run_folder.store import RunStore
 from sfm_audit.reports.text.wording import plain
 
 
@@ -220,3 +225,26 @@ def test_the_snippets_of_the_docs_run(tmp_path, monkeypatch):
     own_table = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)[1]
     exec(own_table, {})  # noqa: S102 - our own page
     assert Path("scales.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_says_what_to_do_and_explains_its_codes(tmp_path):
+    what = ("lenses lack a term", "refit them", "sfm-audit diagnose RUN data/<i>a")
+    diagnosis = Diagnosis(DiagnosisCode.OWN_LENSES, None, "medium", 2, ("<b>.jpg",), *what)
+    finding = Finding(FindingCode.TRACKS_DISAGREE, 3, "3 tracks name other images")
+    ref = make_ref("data/a")
+    models = {"findings": [[finding]], "diagnoses": [[diagnosis]]}
+    reasons = [["misfit_radial: 0.42 px"], ["a_code_of_later: 7"]]
+    with RunStore(tmp_path / "run", settings()) as store:
+        store.write(ref, STATE, sample_tables(ref, models=models, reasons=reasons), 0.1)
+        store.finish(None, [], 1.0)
+    run = RunReader.open(tmp_path / "run")
+    page = Page(html.render_page(html.PageInput(html.read_content(run))))
+    said = " ".join("".join(page.texts).split())
+    assert f"sfm-audit diagnose {run.folder} data/<i>a" in said
+    for words in ("lenses lack a term", "Do: refit them", "2 images, medium, such as <b>.jpg"):
+        assert words in said
+    assert {"code-reason-misfit_radial", "code-finding-tracks_disagree"} <= set(page.ids())
+    assert "code-reason-a_code_of_later" not in page.ids()
+    links = {attrs.get("href", "") for tag, attrs in page.elements if tag == "a"}
+    wanted = {link for link in links if link.startswith("#code-")}
+    assert wanted == {"#code-reason-misfit_radial", "#code-finding-tracks_disagree"}
