@@ -160,9 +160,9 @@ def test_a_wrong_gate_file_is_one_line_and_2(text, words, capsys):
 
 
 def test_runs_of_different_settings_are_2(capsys):
-    write_run(Path("OTHER"), SOUND, config={"alpha": 0.01})
+    write_run(Path("OTHER"), SOUND, config={"noise": "constant"})
     assert check("OTHER", "--baseline", "RUN0") == 2
-    assert "OTHER was made with alpha = 0.01, RUN0 with 0.05" in capsys.readouterr().err
+    assert "OTHER was made with noise = constant, RUN0 with track" in capsys.readouterr().err
     assert main(["learn-band", "OTHER", "RUN0"]) == 2
     assert main(["diff", "OTHER", "RUN0"]) == 0
     assert "verdicts differ for that reason too" in capsys.readouterr().err
