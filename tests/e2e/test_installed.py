@@ -132,6 +132,8 @@ ASKED = (
     ["diff", RUN, RUN],
     ["learn-band", RUN, RUN, "-o", "learned.toml"],
     ["filter", RUN, "--list", "kept.txt"],
+    ["diagnose", RUN, "--no-refit"],
+    ["explain-code", "misfit_radial"],
     ["calibrate", "boards/set_000.csv", "--models", "D1", "-o", "calibration", "--quiet"],
 )
 
