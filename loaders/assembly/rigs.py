@@ -129,6 +129,8 @@ def _not_placed(images: RawImages, problems: dict[int, str]) -> tuple[Finding, .
 
 def _other_poses(images: RawImages, placed: FloatArray) -> tuple[Finding, ...]:
     """Compare the poses of the images file with those that frames and rigs place; the latter are read."""
+    if not len(placed):
+        return ()
     with np.errstate(all="ignore"):
         own, read = (
             rotation_from_quat(each[:, :4] / np.linalg.norm(each[:, :4], axis=1, keepdims=True))

@@ -200,7 +200,7 @@ def test_a_model_that_vanishes_after_it_was_found_costs_one_line(server, bucket)
         ("no-such-bucket", "no bucket of that name"),
         ("BUCKET/nowhere", "expected a folder, found nothing"),
         ("BUCKET/data/0001/images/photo.jpg", "found a file"),
-        ("BUCKET/data/0001/images", "found no file of a model (binary, text)"),
+        ("BUCKET/data/0001/images", "found no file of a model (binary, text, "),
     ],
 )
 def test_a_wrong_path_costs_one_line_and_3(server, bucket, place, text, capsys):
