@@ -166,7 +166,10 @@ class _Complaint:
 
 _COMPLAINTS: Final = (
     _Complaint(
-        ("NETWORK_CONNECTION", "curlCode", "TIMEOUT", "SLOW_DOWN", "THROTTLING", "UNAVAILABLE", "DEADLINE"),
+        (
+            *("NETWORK_CONNECTION", "curlCode", "TIMEOUT", "SLOW_DOWN", "THROTTLING", "UNAVAILABLE", "DEADLINE"),
+            "HTTP status 5",  # a server's own failure, of a request whose answer has no body to say more
+        ),
         UnreadableFileError,
         "an answer of the object store",
         "none",
