@@ -196,10 +196,10 @@ NAMED: Final = (
     ),
     Named(
         "the noise of a camera's images is their largest",
-        "audit/engine/model.py",
-        "float(np.median(self.sigma_constant_px[step.image_idxs]))",
-        "float(np.max(self.sigma_constant_px[step.image_idxs]))",
-        NUMBERS,
+        "audit/joint/own.py",
+        "float(np.median(observations.sigma_px[images]))",
+        "float(np.max(observations.sigma_px[images]))",
+        ("unit/test_joint_own_noise.py",),
     ),
     Named(
         "tau of a camera is the largest of its images",
