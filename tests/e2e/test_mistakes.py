@@ -14,6 +14,7 @@ import pytest
 from gate_samples import scene, write_run
 from run_samples import truncate, write_models
 
+import sfm_audit
 from sfm_audit.audit.cli.main import VERBS, main
 
 MODEL = "data/a/sparse/0"
@@ -189,12 +190,15 @@ def as_somebody_else():
     sealed = [Path("locked"), Path("sealed/images.bin"), Path("secret.toml"), Path("SECRET/run.json")]
     modes = [path.stat().st_mode for path in sealed]
     is_root = os.geteuid() == 0
+    package = Path(sfm_audit.__file__).resolve().parent
     for path in sealed:
         path.chmod(0o000 if path.is_file() else 0o555)
     Path().chmod(0o777)
     if is_root:
         os.seteuid(NOBODY)
     try:
+        if not os.access(package, os.R_OK | os.X_OK, effective_ids=True):
+            pytest.skip("the package lies where nobody else may read it")
         yield
     finally:
         if is_root:
