@@ -88,7 +88,8 @@ class Chart:
     def place(self, x: Any, y: Any) -> FloatArray:
         """Return (n, 2) positions in the drawing."""
         left, top, width, height = self._box
-        out = np.column_stack([left + width * self._x.share(x), top + height * (1.0 - self._y.share(y))])
+        with np.errstate(over="ignore", invalid="ignore"):  # what is out of all bounds stands far away
+            out = np.column_stack([left + width * self._x.share(x), top + height * (1.0 - self._y.share(y))])
         return np.clip(np.nan_to_num(out, nan=-_FAR, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)
 
     def line(self, x: Any, y: Any, look: str) -> None:

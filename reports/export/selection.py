@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from sfm_audit.loaders import ModelRef
 from sfm_audit.loaders.datasets.input_state import read_input_state
@@ -84,7 +84,7 @@ def read_images(run: RunReader) -> tuple[AuditedImage, ...]:
     if run.info.get("status") != "complete":
         raise RunFolderError(run.folder, "holds a run that was not finished", "give its command again first")
     rows = run.rows("images", (*COLUMNS, "fold_group"))
-    images = [AuditedImage(**{**row, "reasons": tuple(row["reasons"] or ())}) for row in rows]
+    images = [_image(run, row) for row in rows]
     if not images:
         raise RunFolderError(run.folder, "holds no audited image", "run it over a dataset that can be read")
     return tuple(
@@ -92,6 +92,14 @@ def read_images(run: RunReader) -> tuple[AuditedImage, ...]:
             images, key=lambda image: (image.dataset, image.scene, image.component, image.model_path, image.image_id)
         )
     )
+
+
+def _image(run: RunReader, row: Mapping[str, Any]) -> AuditedImage:
+    missing = [name for name in COLUMNS if name not in row]
+    if missing:
+        problem = f"has tables of images without {', '.join(missing)}"
+        raise RunFolderError(run.folder, problem, "audit the models again into a new folder")
+    return AuditedImage(**{**row, "reasons": tuple(row["reasons"] or ())})
 
 
 def on_side(run: RunReader, images: Sequence[AuditedImage], group: int) -> tuple[AuditedImage, ...]:

@@ -92,6 +92,12 @@ def test_a_chart_places_what_it_draws_where_its_axes_say():
     assert np.isfinite(chart.place([np.nan, np.inf], [np.nan, -1.0])).all()
 
 
+def test_what_is_out_of_all_bounds_stands_far_away_without_a_warning():
+    chart = Chart(Axis(0.0, 1.0), Axis(0.0, 1.0))
+    places = chart.place(np.array([0.0, 1e307, np.nan]), np.array([0.0, -1e307, np.inf]))
+    assert np.isfinite(places).all()
+
+
 def test_arrows_end_where_they_should():
     d = arrow_path(np.array([[0.0, 0.0]]), np.array([[30.0, 0.0]]), 3.0)
     assert d.startswith("M0.0 0.0L30.0 0.0M")

@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from sfm_audit.loaders import ModelRef
 from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
 from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.export.selection import (
+    COLUMNS,
     Keep,
     images_of_model,
     list_text,
@@ -185,3 +188,13 @@ def test_a_model_that_changed_or_was_not_audited_is_refused(audited):
     write_binary(folder / "a", tiny_model().but(points=()))
     with pytest.raises(RunFolderError, match="before its files changed"):
         images_of_model(run, images, folder / "a")
+
+
+def test_a_table_without_a_column_is_named():
+    run = SimpleNamespace(
+        folder=Path("RUN"), info={"status": "complete"}, rows=lambda *_: iter([dict.fromkeys(COLUMNS[:-1])])
+    )
+    with pytest.raises(
+        RunFolderError, match=f"RUN: has tables of images without {COLUMNS[-1]}; audit the models again"
+    ):
+        read_images(run)
