@@ -16,13 +16,25 @@ from sfm_audit.loaders.foreign.bundler import BUNDLER
 from sfm_audit.loaders.foreign.kapture import KAPTURE
 from sfm_audit.loaders.foreign.nvm import NVM
 from sfm_audit.loaders.foreign.openmvg import OPENMVG
+from sfm_audit.loaders.foreign.openmvg_binary import OPENMVG_BINARY
 from sfm_audit.loaders.foreign.opensfm import OPENSFM
 from sfm_audit.loaders.model import PairSource, SparseModel
 from sfm_audit.loaders.model_format import ModelFormat, ModelWriter, matching
 from sfm_audit.loaders.paths.files import exists, is_folder, names_in
 from sfm_audit.loaders.paths.locations import InputPath
 
-FORMATS: tuple[ModelFormat, ...] = (BINARY, TEXT, OPENSFM, OPENMVG, BUNDLER, NVM, BAL, BLOCKS_EXCHANGE, KAPTURE)
+FORMATS: tuple[ModelFormat, ...] = (
+    BINARY,
+    TEXT,
+    OPENSFM,
+    OPENMVG_BINARY,
+    OPENMVG,
+    BUNDLER,
+    NVM,
+    BAL,
+    BLOCKS_EXCHANGE,
+    KAPTURE,
+)
 """Asked in this order: the first format whose required files all lie in a folder is the one that is read there."""
 
 WITHOUT_POINTS: Final[Mapping[str, str]] = {

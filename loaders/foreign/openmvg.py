@@ -1,4 +1,4 @@
-r"""OpenMVG: ``sfm_data.json`` with structure.
+r"""OpenMVG: ``sfm_data.json`` with structure; what its ``sfm_data.bin`` says differently stands in `openmvg_binary`.
 
 Facts, of OpenMVG's documentation ("SfM_Data format") and of ``src/openMVG/sfm/*_io.hpp``, ``src/openMVG/cameras`` and
 ``src/openMVG/geometry/pose3.hpp`` (version 2.1):
@@ -21,11 +21,11 @@ Facts, of OpenMVG's documentation ("SfM_Data format") and of ``src/openMVG/sfm/*
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.assembly.raw import RawCamera, RawModel
 from sfm_audit.loaders.foreign.json_file import JsonPlace, read_json, rows
 from sfm_audit.loaders.foreign.lens import camera_of
@@ -41,7 +41,7 @@ _ADVICE: Final = (
 )
 _NEW: Final = 0x80000000
 _NONE: Final = 2**32 - 1
-_COEFFICIENTS: Final = {
+COEFFICIENTS: Final = {
     "pinhole": ("", ()),
     "pinhole_radial_k1": ("disto_k1", ("k1",)),
     "pinhole_radial_k3": ("disto_k3", ("k1", "k2", "k3")),
@@ -49,6 +49,24 @@ _COEFFICIENTS: Final = {
     "fisheye": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
 """Where each kind of camera keeps its coefficients, and what they are called here."""
+
+
+class View(NamedTuple):
+    """One photo as the file names it, placed or not."""
+
+    view_id: int
+    folder: str
+    name: str
+    camera_id: int
+    pose_id: int
+
+
+class Poses(NamedTuple):
+    """All poses of a file. pose_id: n.    matrices: (n, 3, 3) cam from world.    centres: (n, 3), world."""
+
+    pose_id: Sequence[int]
+    matrices: FloatArray
+    centres: FloatArray
 
 
 def read(folder: InputPath) -> RawModel:
@@ -152,16 +170,21 @@ def _cameras(place: JsonPlace) -> list[RawCamera]:
     found = []
     for camera_id, value in zip(*_entries(place), strict=True):
         kind, data = pointers.name_of(value), pointers.data_of(value)
-        if kind not in _COEFFICIENTS:
-            raise value.malformed(f"a camera that is read ({', '.join(_COEFFICIENTS)})", f"{kind!r:.40}")
+        if kind not in COEFFICIENTS:
+            raise value.malformed(f"a camera that is read ({', '.join(COEFFICIENTS)})", f"{kind!r:.40}")
         size = _field(data, "width").whole(), _field(data, "height").whole()
         centre = _field(data, "principal_point").numbers(2)
-        values = {"fx": _field(data, "focal_length").number(), "cx": centre[0], "cy": centre[1]}
-        key, names = _COEFFICIENTS[kind]
-        if names:
-            values |= dict(zip(names, _field(data, key).numbers(len(names)), strict=True))
-        found.append(camera_of(camera_id, size, values, is_fisheye=kind == "fisheye"))
+        focal = _field(data, "focal_length").number()
+        key, names = COEFFICIENTS[kind]
+        coefficients = _field(data, key).numbers(len(names)) if names else []
+        found.append(camera(camera_id, kind, size, (focal, *centre, *coefficients)))
     return found
+
+
+def camera(camera_id: int, kind: str, size: tuple[int, int], params: Sequence[float]) -> RawCamera:
+    """Return a camera of a kind of `COEFFICIENTS`; ``params``: f, cx, cy and its coefficients."""
+    values = dict(zip(("fx", "cx", "cy", *COEFFICIENTS[kind][1]), params, strict=True))
+    return camera_of(camera_id, size, values, is_fisheye=kind == "fisheye")
 
 
 def _images(top: JsonPlace) -> tuple[list[PlacedImage], tuple[Finding, ...]]:
@@ -172,22 +195,32 @@ def _images(top: JsonPlace) -> tuple[list[PlacedImage], tuple[Finding, ...]]:
     for pose, matrix in zip(poses, matrices, strict=True):
         if matrix.shape != (3, 3):
             raise pose.malformed("a rotation of 3 rows", f"{len(matrix)}")
-    names = [f"pose {pose_id}" for pose_id in pose_ids]
-    quats, findings = quats_from_matrices(top.path, np.array(matrices).reshape(-1, 3, 3), names)
     centres = rows(extrinsics, [pose.get("center").value for pose in poses], 3)
-    translations = -rotate(quats, centres)
-    pose_row = {pose_id: row for row, pose_id in enumerate(pose_ids)}
     pointers = _Pointers()
-    images = []
+    views = []
     for view_id, value in zip(*_entries(top.get("views")), strict=True):
         data = pointers.data_of(value)
-        camera_id, row = _field(data, "id_intrinsic").whole(), pose_row.get(_field(data, "id_pose").whole())
-        if row is None or camera_id == _NONE:
+        ids = _field(data, "id_intrinsic").whole(), _field(data, "id_pose").whole()
+        views.append(View(view_id, _field(data, "local_path").text(), _field(data, "filename").text(), *ids))
+    return placed_images(top.path, views, Poses(pose_ids, np.array(matrices).reshape(-1, 3, 3), centres))
+
+
+def placed_images(
+    path: InputPath, views: Sequence[View], poses: Poses
+) -> tuple[list[PlacedImage], tuple[Finding, ...]]:
+    """Return the views that have a pose and an intrinsic, and what is to be said of the poses."""
+    names = [f"pose {pose_id}" for pose_id in poses.pose_id]
+    quats, findings = quats_from_matrices(path, poses.matrices, names)
+    translations = -rotate(quats, poses.centres)
+    pose_row = {pose_id: row for row, pose_id in enumerate(poses.pose_id)}
+    images = []
+    for view in views:
+        row = pose_row.get(view.pose_id)
+        if row is None or view.camera_id == _NONE:
             continue
-        folder, name = _field(data, "local_path").text(), _field(data, "filename").text()
-        shown = f"{folder.rstrip('/')}/{name}" if folder else name
+        shown = f"{view.folder.rstrip('/')}/{view.name}" if view.folder else view.name
         numbers = (*quats[row].tolist(), *translations[row].tolist())
-        images.append(PlacedImage(view_id, shown, camera_id, numbers))
+        images.append(PlacedImage(view.view_id, shown, view.camera_id, numbers))
     return images, findings
 
 

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import foreign_openmvg_binary as mvg
 import foreign_scene as fs
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ FILES = {
     "blocks_exchange": fs.blocks_exchange_files(TINY),
     "kapture": fs.kapture_files(TINY, with_rig=True),
     "openmvg": fs.openmvg_files(TINY, "pinhole_radial_k1"),
+    "openmvg_binary": mvg.openmvg_binary_files(TINY, "pinhole_radial_k1"),
 }
 MODEL = {"kapture": "reconstruction"}
 """Where the model lies below the folder that was written."""

@@ -3,6 +3,7 @@
 import json
 import re
 
+import foreign_openmvg_binary as mvg
 import foreign_scene as fs
 import numpy as np
 import pyarrow as pa
@@ -25,6 +26,10 @@ def openmvg(kind: str, *, wrapped: bool = False):
     return lambda made: fs.openmvg_files(made, kind, wrapped=wrapped)
 
 
+def openmvg_binary(kind: str, order: str = "<"):
+    return lambda made: mvg.openmvg_binary_files(made, kind, order)
+
+
 FORMATS = {
     # (file format, writer, lens of the scene, kind, COLMAP's model, a camera per image)
     "bundler": ("bundler", fs.bundler_files, {}, "perspective", "RADIAL", True),
@@ -41,6 +46,8 @@ FORMATS = {
     "openmvg k1": ("openmvg", openmvg("pinhole_radial_k1"), {"k2": 0.0}, "perspective", "SIMPLE_RADIAL", False),
     "openmvg k3": ("openmvg", openmvg("pinhole_radial_k3", wrapped=True), {"cx": 4.0}, "perspective", "RADIAL", False),
     "openmvg fisheye": ("openmvg", openmvg("fisheye"), {}, "fisheye", "RADIAL_FISHEYE", False),
+    "openmvg bin": ("openmvg_binary", openmvg_binary("pinhole"), PLAIN, "perspective", "SIMPLE_PINHOLE", False),
+    "openmvg bin k3": ("openmvg_binary", openmvg_binary("pinhole_radial_k3", ">"), {}, "perspective", "RADIAL", False),
 }
 
 
@@ -184,6 +191,7 @@ OTHER_LENSES = {
     ),
     "openmvg brown wrapped": (openmvg("pinhole_brown_t2", wrapped=True), {"p1": 1e-3}, "SIMPLE_BROWN", "FULL_OPENCV"),
     "openmvg radial": (openmvg("pinhole_radial_k3"), {"k3": 0.004}, "RADIAL_3", "FULL_OPENCV"),
+    "openmvg brown binary": (openmvg_binary("pinhole_brown_t2"), {"p1": 1e-3}, "SIMPLE_BROWN", "FULL_OPENCV"),
 }
 
 
