@@ -6,14 +6,15 @@ import sys
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 from tqdm import tqdm
 
+from sfm_audit.audit.cli.diagnose_json import diagnosis_bytes, model_as_json
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
-from sfm_audit.audit.cli.runs import open_run
-from sfm_audit.audit.cli.terminal import print_page, terminal_page
+from sfm_audit.audit.cli.runs import open_run, write_file
+from sfm_audit.audit.cli.terminal import is_stdout, print_page, terminal_page
 from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.diagnoses import DiagnosisCode
 from sfm_audit.loaders.camera_models import BY_NAME
@@ -35,9 +36,12 @@ MAX_IMAGES: Final = 300  # of a model that is refitted unasked: adjusting takes 
 )
 @click.option("--refit/--no-refit", default=None, help=f"Refit.  [default: models of up to {MAX_IMAGES} images]")
 @click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help="Write the model refitted --as here.")
+@click.option(
+    "--json", "json_file", metavar="FILE", type=click.Path(path_type=Path), help="Write all as JSON; - is stdout."
+)
 @click.option("--quiet", is_flag=True, help="No progress; errors are still said.")
-def command(
-    *, run_folder: Path, model: str | None, wanted: tuple[str, ...], refit: bool | None, out: Path | None, quiet: bool
+def command(  # one parameter per option
+    *, run_folder: Path, model: str | None, wanted: tuple[str, ...], refit: bool | None, out: Path | None, **output: Any
 ) -> ExitCode:
     """Say what the residuals of the models in RUN tell beyond the tables, and what adjusting them again would do.
 
@@ -45,10 +49,12 @@ def command(
     it lies as RUN read it. It is adjusted by pycolmap as it is, which is the control, and with the camera models that
     are advised (else, or where none of these helps, with larger ones), then audited again with the settings of RUN.
 
-    Exit codes: 0 fine; 2 wrong usage, or RUN holds no such model; 3 RUN or a model cannot be read; 4 DIR could not be
-    written.
+    Exit codes: 0 fine; 2 wrong usage, or RUN holds no such model; 3 RUN or a model cannot be read; 4 DIR or FILE could
+    not be written.
     """
     _refuse(wanted, refit, out)
+    json_file: Path | None = output["json_file"]
+    quiet, is_page_aside = bool(output["quiet"]), is_stdout(json_file)
     try:
         run = open_run(run_folder, quiet=quiet)
         chosen = _chosen(run, model)
@@ -56,14 +62,21 @@ def command(
             raise KnownError(f"--out takes one MODEL, {len(chosen)} are meant; name one", ExitCode.USAGE)
         shown = tqdm(chosen, unit="model", disable=quiet or not sys.stderr.isatty())
         named = [model] if model else []
-        codes = [_diagnose(run, row, wanted, refit=refit, out=out, named=named) for row in shown]
+        told = []
+        for row in shown:
+            told.append(_diagnose(run, row, wanted, refit=refit, out=out, named=named))
+            if told[-1]["problem"] is None:
+                print_page(_page(run, row, told[-1]), to_stderr=is_page_aside)
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     except OutputError as error:
         raise KnownError(str(error), ExitCode.OUTPUT) from error
     if not chosen:
-        print_page(f"{plain(str(run_folder))}: nothing speaks against any of its {run.num_models} models")
-    return max([ExitCode.OK, *codes])
+        said = f"{plain(str(run_folder))}: nothing speaks against any of its {run.num_models} models"
+        print_page(said, to_stderr=is_page_aside)
+    if json_file is not None:
+        write_file(json_file, diagnosis_bytes(run_folder, told))
+    return ExitCode.UNREADABLE_INPUT if any(each["problem"] for each in told) else ExitCode.OK
 
 
 def _refuse(wanted: tuple[str, ...], refit: bool | None, out: Path | None) -> None:
@@ -94,7 +107,8 @@ def _codes(row: Row) -> set[str]:
 
 def _diagnose(
     run: RunReader, row: Row, wanted: tuple[str, ...], *, refit: bool | None, out: Path | None, named: list[str]
-) -> ExitCode:
+) -> dict[str, Any]:
+    """Return what `model_as_json` says of a model; a model that cannot be read is complained of."""
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - help and errors import nothing that audits
 
     from sfm_audit.audit.cli.recompute import ResidualSource  # noqa: PLC0415
@@ -105,7 +119,7 @@ def _diagnose(
         auditor = ResidualSource(run, named).auditor(row["model_path"])
     except ResidualError as error:
         complain(f"{row['model_path']}: not diagnosed: {error}")
-        return ExitCode.UNREADABLE_INPUT
+        return model_as_json(row, None, str(error))
     unfit = [name for name in wanted if with_cameras(auditor.model, name) is None]
     if unfit:
         raise KnownError(f"--as {unfit[0]}: cannot express the cameras of {row['model_path']}", ExitCode.USAGE)
@@ -116,9 +130,12 @@ def _diagnose(
     )
     with threadpool_limits(limits=1, user_api="blas"), ExitStack() as stack:
         found = diagnose(out=None if out is None else stack.enter_context(new_folder(out)))
-    text = EvidenceText(found.readings, found.refit_readings, found.conclusion)
-    print_page(render_evidence(row, text, run.folder, terminal_page().width))
-    return ExitCode.OK
+    return model_as_json(row, found, None)
+
+
+def _page(run: RunReader, row: Row, told: dict[str, Any]) -> str:
+    text = EvidenceText(told["readings"], [each["reading"] for each in told["refits"]], told["conclusion"])
+    return render_evidence(row, text, run.folder, terminal_page().width)
 
 
 def _rows_of(run: RunReader, table: str, model_path: str) -> list[Row]:

@@ -42,8 +42,8 @@ class ToldImage:
 def tell(auditor: ModelAuditor, image_idx: int) -> ToldImage:
     """Audit a model, and tell the story of the image in row ``image_idx``."""
     with threadpool_limits(limits=1, user_api="blas"):
-        row = _row(auditor, image_idx)
-    return _told_with_model(auditor, image_idx, row, auditor.config.model_dump())
+        row, model = _rows(auditor, image_idx)
+    return _told_with_model(auditor, image_idx, Story(row, auditor.config.model_dump(), "", None, {}, model=model))
 
 
 def tell_from_run(run: RunReader, row: Mapping[str, Any]) -> ToldImage:
@@ -51,7 +51,8 @@ def tell_from_run(run: RunReader, row: Mapping[str, Any]) -> ToldImage:
 
     Pictures are drawn from the model where it lies as the run read it, else from RUN/observations, else not at all.
     """
-    config, source = run.info["config"], ResidualSource(run)
+    source, again = ResidualSource(run), run.info.get("decided_again")
+    story = Story(row, run.info["config"], row["model_path"], None, {}, again, _model_row(run, row))
     try:
         auditor = source.auditor(row["model_path"])
     except ResidualError as error:
@@ -59,30 +60,23 @@ def tell_from_run(run: RunReader, row: Mapping[str, Any]) -> ToldImage:
     else:
         found = np.flatnonzero(auditor.model.images.image_id == row["image_id"])
         if len(found):
-            return _told_with_model(auditor, int(found[0]), row, config, run.info.get("decided_again"))
+            return _told_with_model(auditor, int(found[0]), story)
         problem = f"{row['model_path']}: holds no image of id {row['image_id']} any more"
     if not run.has_part("observations", row["part"]):
-        story = Story(row, config, row["model_path"], None, {}, run.info.get("decided_again"))
         return ToldImage(row, f"{render_story(story)}\nNo pictures: {plain(problem)}\n")
     residuals = source.residuals(row)
-    drawn = _figures(row, config, residuals, None, None)
-    return _told(Story(row, config, row["model_path"], None, {}, run.info.get("decided_again")), drawn, residuals)
+    return _told(story, _figures(story, residuals, None, None), residuals)
 
 
-def _told_with_model(
-    auditor: ModelAuditor,
-    image_idx: int,
-    row: Mapping[str, Any],
-    config: Mapping[str, Any],
-    decided_again: str | None = None,
-) -> ToldImage:
+def _told_with_model(auditor: ModelAuditor, image_idx: int, story: Story) -> ToldImage:
+    row = story.row
     with threadpool_limits(limits=1, user_api="blas"):
         residuals = image_residuals_of(auditor, image_idx, row)
         field_px = explained_field(auditor, image_idx, row)
         error_px = _expected_error(auditor, image_idx, row)
-    drawn = _figures(row, config, residuals, field_px, error_px)
+    drawn = _figures(story, residuals, field_px, error_px)
     where = None if field_px is None else strongest_where(residuals.xy_px, field_px, residuals.size_px)
-    return _told(Story(row, config, auditor.model.location, where, {}, decided_again), drawn, residuals)
+    return _told(replace(story, location=auditor.model.location, where=where), drawn, residuals)
 
 
 def _told(story: Story, drawn: Mapping[str, Figure], residuals: Residuals) -> ToldImage:
@@ -92,11 +86,16 @@ def _told(story: Story, drawn: Mapping[str, Figure], residuals: Residuals) -> To
     return ToldImage(story.row, render_story(replace(story, pictures=captions)), pictures, captions, residuals)
 
 
-def _row(auditor: ModelAuditor, image_idx: int) -> dict[str, Any]:
-    """The image's row of the table ``images``: q-values need all images of the model."""
-    labels = ModelLabels("", "", "0", auditor.model.location)
-    row: dict[str, Any] = auditor.tables(labels).images.slice(image_idx, 1).to_pylist()[0]
-    return row
+def _rows(auditor: ModelAuditor, image_idx: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The rows of the image and of its model: q-values and findings need all images."""
+    tables = auditor.tables(ModelLabels("", "", "0", auditor.model.location))
+    return tables.images.slice(image_idx, 1).to_pylist()[0], tables.models.to_pylist()[0]
+
+
+def _model_row(run: RunReader, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the row of ``RUN/models`` of the image's model."""
+    rows = run.rows("models", ("model_path", "num_images", "findings"))
+    return next((each for each in rows if each["model_path"] == row["model_path"]), None)
 
 
 def _expected_error(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any]) -> FloatArray | None:
@@ -112,12 +111,9 @@ def _expected_error(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any
 
 
 def _figures(
-    row: Mapping[str, Any],
-    config: Mapping[str, Any],
-    residuals: Residuals,
-    field_px: FloatArray | None,
-    error_px: FloatArray | None,
+    story: Story, residuals: Residuals, field_px: FloatArray | None, error_px: FloatArray | None
 ) -> dict[str, Figure]:
+    row, config = story.row, story.config
     drawn = {
         "residual_vectors": figures.residual_vectors(residuals),
         "residual_field": figures.residual_field(residuals),

@@ -103,7 +103,8 @@ class ReconstructionAudit:
         except KeyError:
             some = ", ".join(plain(each) for each in names[:_EXAMPLES])
             raise KeyError(f"no image {plain(name)!r}; there are {some} ... (or id:<image_id>)") from None
-        return ImageResult(self._auditor, image_idx, self.tables.images.slice(image_idx, 1).to_pylist()[0])
+        row = self.tables.images.slice(image_idx, 1).to_pylist()[0]
+        return ImageResult(self._auditor, image_idx, row, self._model_row)
 
     def __repr__(self) -> str:
         return f"<{brief_line(self._verdicts(), self._model_row, self.config.policy)}>"
@@ -129,9 +130,10 @@ class ImageResult:
         Its row of the table ``images`` (docs/tables.md).
     """
 
-    def __init__(self, auditor: ModelAuditor, image_idx: int, row: dict[str, Any]) -> None:
+    def __init__(self, auditor: ModelAuditor, image_idx: int, row: dict[str, Any], model_row: dict[str, Any]) -> None:
         self._auditor = auditor
         self._image_idx = image_idx
+        self._model_row = model_row
         self.row = row
 
     @property
@@ -158,7 +160,7 @@ class ImageResult:
     def explain(self, width: int = 100) -> Text:
         """Return the whole story as text: why, which questions were asked, and what a verdict does not prove."""
         with quietly():
-            return Text(story_of(self._auditor, self._image_idx, self.row, width))
+            return Text(story_of(self._auditor, self._image_idx, self.row, self._model_row, width))
 
     def plot(self, ax: Axes | None = None, *, magnify: float | None = None) -> Axes:
         """Draw the residuals as arrows over the image, magnified (extra ``report``).

@@ -32,10 +32,13 @@ def xyz_cam_of(auditor: ModelAuditor, image_idx: int) -> FloatArray:
     return auditor.model.image(image_idx).cam_from_world(auditor.inliers(image_idx).xyz_world)
 
 
-def story_of(auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any], width: int = 100) -> str:
-    """Return the whole story of the image in row ``image_idx``; ``row``: of the table ``images``."""
+def story_of(
+    auditor: ModelAuditor, image_idx: int, row: Mapping[str, Any], model_row: Mapping[str, Any], width: int = 100
+) -> str:
+    """Return the whole story of the image in row ``image_idx``; its row of ``images``, its model's of ``models``."""
     field_px = explained_field(auditor, image_idx, row)
     where = None
     if field_px is not None:
         where = strongest_where(auditor.inliers(image_idx).xy_px, field_px, (row["width"], row["height"]))
-    return render_story(Story(row, auditor.config.model_dump(), auditor.model.location, where, {}), width)
+    story = Story(row, auditor.config.model_dump(), auditor.model.location, where, {}, model=model_row)
+    return render_story(story, width)

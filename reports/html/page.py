@@ -11,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
+from sfm_audit.audit.table.concerns import findings_about
 from sfm_audit.audit.table.thresholds import ALPHA, effect_px
 from sfm_audit.audit.table.words import MEMBER_QUESTIONS, POLICIES, Member, Verdict
 from sfm_audit.loaders.camera_models import BY_NAME
@@ -49,7 +50,6 @@ def render_page(page: PageInput) -> str:
     content, info = page.content, page.content.run.info
     places = Places.of(content)
     views = [draw_view(view, content.rows) for view in page.views]
-    worst = content.rows[: len(page.pictures)]
     diagnoses, num_diagnoses = diagnoses_of(content)
     codes = codes_of(content)
     return (
@@ -75,7 +75,7 @@ def render_page(page: PageInput) -> str:
             num_cameras=content.num_cameras,
             max_cameras=MAX_CAMERAS,
             views=views,
-            worst=[_worst(i, row, page.pictures[i]) for i, row in enumerate(worst)],
+            worst=_worst_images(page),
             no_photos=page.no_photos,
             num_rows=len(content.rows),
             diagnoses=diagnoses,
@@ -286,13 +286,21 @@ def _correlations(row: Row) -> list[Picture]:
     return [Picture(caption, cameras.correlations(names, lower, label=caption))]
 
 
-def _worst(index: int, row: Row, pictures: ImagePictures) -> dict[str, Any]:
+def _worst_images(page: PageInput) -> list[dict[str, Any]]:
+    models = {row["model_path"]: row for row in page.content.models}
+    shown = zip(page.content.rows, page.pictures, strict=False)
+    return [_worst(i, row, pictures, models.get(row["model_path"])) for i, (row, pictures) in enumerate(shown)]
+
+
+def _worst(index: int, row: Row, pictures: ImagePictures, model: Row | None) -> dict[str, Any]:
+    findings = findings_about(row, model["findings"] or [], model["num_images"] or 0) if model else []
     return {
         "anchor": f"worst-{index}",
         "name": plain(row["image_name"]),
         "place": plain(f"{row['scene']}/{row['component']}"),
         "verdict": row["verdict"],
         "reasons": [plain_reason(reason, row) for reason in reasons_of(row)],
+        "findings": [(plain(str(finding["code"])), plain(finding["text"])) for finding in findings],
         "facts": f"{row['num_inliers']} inliers, RMS {px(row['rms_px'])} px, "
         f"predicted noise {px(row['sigma_predicted_px'])} px, coverage {number(row['coverage'])}",
         "pictures": pictures.pictures,

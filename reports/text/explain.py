@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfm_audit.audit.table.concerns import findings_about
 from sfm_audit.audit.table.words import (
     MEMBER_QUESTIONS,
     MISFIT_CODES,
@@ -22,7 +23,7 @@ from sfm_audit.audit.table.words import (
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.reports.text.reasons import reasons_of
-from sfm_audit.reports.text.wording import number, paragraph, plain, probability, px
+from sfm_audit.reports.text.wording import counted, number, paragraph, plain, probability, px
 
 LIMITS: Final = (
     "KS judges the noise, not the camera: a correct camera with odd noise can be rejected, and a wrong lens can pass.",
@@ -139,7 +140,8 @@ class Story:
     """What is told about one image.
 
     row: of ``RUN/images``.    where: of `strongest_where`.    pictures: file name -> caption.
-    decided_again: the settings after the run, in words; None for its own.
+    decided_again: the settings after the run, in words; None for its own.    model: the row of ``RUN/models`` of its
+    model, whose findings are told; None where nobody has it.
     """
 
     row: Mapping[str, Any]
@@ -148,6 +150,7 @@ class Story:
     where: str | None
     pictures: Mapping[str, str]
     decided_again: str | None = None
+    model: Mapping[str, Any] | None = None
 
 
 def render_story(story: Story, width: int = 100) -> str:
@@ -160,6 +163,7 @@ def render_story(story: Story, width: int = 100) -> str:
         _heading(story, width),
         _bullets("Why", decide, story, width) if decide else "Why\n  nothing speaks against it",
         _bullets("Remarks (decide nothing)", remarks, story, width) if remarks else "",
+        _finding_lines(row, story.model, width) if story.model else "",
         _verdict_lines(row),
         _camera_lines(row, width),
         _number_lines("What it was measured with", _observation_facts(row)),
@@ -234,6 +238,20 @@ def _heading(story: Story, width: int) -> str:
 def _bullets(title: str, reasons: Sequence[Mapping[str, Any]], story: Story, width: int) -> str:
     lines = [paragraph(f"- {plain_reason(r, story.row, where=story.where)}", width, "  ") for r in reasons]
     return "\n".join([title, *lines])
+
+
+def _finding_lines(row: Mapping[str, Any], model: Mapping[str, Any], width: int) -> str:
+    """Say which findings of the model concern the image, and how many do not."""
+    findings = model["findings"] or []
+    about = findings_about(row, findings, model["num_images"])
+    others = len(findings) - len(about)
+    lines = [paragraph(f"- {plain(f['code'])}: {plain(f['text'])}", width, "  ") for f in about]
+    if others:
+        more = "more finding" if about else "finding"
+        lines.append(paragraph(f"- {counted(others, more)} about other images, or points and files", width))
+    if not lines:
+        return ""
+    return "\n".join(["Findings about its model (sfm-audit explain-code CODE says what to do)", *lines])
 
 
 def _verdict_lines(row: Mapping[str, Any]) -> str:

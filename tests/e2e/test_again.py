@@ -1,5 +1,6 @@
 """A finished run under another policy, effect, reason or severity: what the verbs say, without an audit."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scripts.corpus.models import models_of
+from scripts.corpus.page import document, without_action
 from sfm_audit.audit.cli import again, recompute
 from sfm_audit.audit.cli.main import main
 from sfm_audit.audit.simulate.adjust import write_adjusted_model
@@ -166,3 +169,31 @@ def test_the_report_says_that_it_was_decided_again(runs):
     assert main(["report", run, "--worst", "0", "--policy", "camera", "--severity", "hard", "--quiet"]) == 0
     page = Path("report.html").read_text(encoding="utf-8")
     assert "policy camera instead of standard; only rejections of severity hard count" in page
+
+
+def test_a_diagnosis_as_json_is_what_the_page_of_the_corpus_is_made_of(runs, capsys):
+    run = runs / "standard"
+    assert main(["diagnose", str(run), "photos", "--no-refit", "--quiet", "--json", "-"]) == 0
+    out, err = capsys.readouterr()
+    (found,) = json.loads(out)["models"]
+    assert "What is the matter" in err
+    assert (found["problem"], found["refits"], found["conclusion"]) == (None, [], "Not refitted.")
+    assert found["numbers"]["rejected"] == 5
+    models, unread = models_of(run, [found])
+    page = document(models, unread)
+    assert "### photos" in page
+    assert all(each["action"] in " ".join(page.split()) for each in found["diagnoses"])
+    assert "\n- nothing\n" in page
+    assert without_action(models) == []
+    models[0].model["diagnoses"] = found["diagnoses"][1:]
+    assert without_action(models) == ["photos: 7 images are not accepted, diagnoses speak of 5"]
+    assert without_action(models_of(run, [])[0]) == ["photos: was not diagnosed"]
+
+
+def test_a_model_that_is_gone_is_said_in_the_json_too(runs, capsys, monkeypatch):
+    monkeypatch.setattr(recompute, "allowed_location", lambda *_: "nowhere")
+    assert main(["diagnose", str(runs / "standard"), "--json", "found.json"]) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    (found,) = json.loads(Path("found.json").read_bytes())["models"]
+    assert "the model cannot be read any more (nowhere: " in found["problem"]
+    assert (found["numbers"], found["conclusion"]) == ({}, None)

@@ -7,7 +7,8 @@ import pycolmap
 import pytest
 
 from sfm_audit.audit import AuditConfig, ModelAuditor
-from sfm_audit.audit.diagnose.model import advised, diagnose_model
+from sfm_audit.audit.cli.diagnose_json import model_as_json
+from sfm_audit.audit.diagnose.model import ModelEvidence, advised, diagnose_model
 from sfm_audit.audit.diagnose.reading import conclusion, helps, readings, refit_reading
 from sfm_audit.audit.diagnose.refit import Refit, candidates, refit, with_cameras
 from sfm_audit.audit.diagnose.summary import summary_numbers
@@ -145,6 +146,17 @@ def test_every_sentence_has_its_numbers(changed, said):
 def test_fields_too_small_for_a_sentence_are_left_out():
     assert readings({"smooth_px": 0.05}, FOUND) == []
     assert readings({"smooth_px": math.nan}, {}) == []
+
+
+def test_json_knows_no_nan():
+    row = dict.fromkeys(("dataset", "scene", "component", "model_path", "diagnoses"), "x")
+    failed = Refit("RADIAL", {"a": math.inf}, "it is odd")
+    found = ModelEvidence({"a": math.nan, "b": 1.0}, ("said",), (failed,), ("RADIAL: said",), "So.")
+    told = model_as_json(row, found, None)
+    assert told["numbers"] == {"a": None, "b": 1.0}
+    assert told["refits"][0]["numbers"] == {"a": None}
+    assert told["refits"][0]["reading"] == "RADIAL: said"
+    assert (told["scene"], told["readings"], told["conclusion"]) == ("x", ["said"], "So.")
 
 
 def test_a_summary_counts_and_takes_medians(audited):

@@ -1,8 +1,12 @@
+import math
+
 import numpy as np
 import pytest
 from run_samples import sample_table
 
+from sfm_audit.audit.table.concerns import findings_about
 from sfm_audit.audit.table.words import ReasonCode
+from sfm_audit.loaders.model import FindingCode
 from sfm_audit.reports.text.explain import LIMITS, REASON_CODES, Story, plain_reason, render_story, strongest_where
 
 SIZE = (1600.0, 1200.0)
@@ -93,3 +97,54 @@ def test_the_story_fits_its_width_and_ends_with_what_it_does_not_prove():
     assert text.index("Why") < text.index("Remarks (decide nothing)") < text.index("What a verdict does not prove")
     assert all(len(line) <= 100 for line in text.splitlines() if "xxx" not in line)
     assert LIMITS[-1] in text
+
+
+def found(code, count=1, text="what was found"):
+    return {"code": str(code), "count": count, "text": text}
+
+
+@pytest.mark.parametrize(
+    ("code", "shown", "hidden"),
+    [
+        (FindingCode.DANGLING_POINT_IDS, {"num_dangling": 1}, {"num_dangling": 0}),
+        (FindingCode.NON_FINITE_POINTS, {"num_nonfinite": 2}, {"num_nonfinite": 0}),
+        (FindingCode.NON_FINITE_OBSERVATIONS, {"num_nonfinite": 2}, {"num_nonfinite": None}),
+        (FindingCode.POINTS_BEHIND, {"num_behind": 1}, {"num_behind": 0}),
+        (FindingCode.CONTRADICTED_PAIRS, {"num_pairs_contradicting": 1}, {"num_pairs_contradicting": None}),
+        (FindingCode.MISSING_CAMERAS, {"camera_model": None}, {}),
+        (FindingCode.NON_FINITE_POSES, {"reasons": ["non_finite_pose: nan"]}, {"reasons": ["ks_rejected: p = 0"]}),
+        (FindingCode.NON_FINITE_CAMERAS, {"params": [math.nan, 1.0]}, {"params": None}),
+        (FindingCode.IMPLAUSIBLE_CAMERAS, {"plausible": "rejected"}, {"plausible": "undetermined"}),
+        (FindingCode.IMAGES_DISAGREE, {"reasons": ["inconsistent: 9 px"]}, {"reasons": None}),
+        (FindingCode.IMAGES_DISAGREE, {"reasons": ["points_behind: 8 of 9"]}, {"reasons": []}),
+        (FindingCode.EXACT_PROJECTIONS, {"reasons": ["exact_projections: 0 px"]}, {"reasons": []}),
+        (FindingCode.POSSIBLE_FOLD, {"reasons": ["fold_disagrees: 0.9"]}, {"reasons": []}),
+    ],
+)
+def test_a_finding_about_some_images_stands_at_those_whose_row_shows_it(code, shown, hidden):
+    assert findings_about(row(**shown), [found(code)], 5) == [found(code)]
+    assert findings_about(row(**hidden), [found(code)], 5) == []
+
+
+@pytest.mark.parametrize("code", [FindingCode.IMPLIED_RADIAL, FindingCode.NON_UNIT_QUATERNIONS])
+def test_a_finding_that_only_counts_concerns_an_image_where_it_counts_all(code):
+    assert findings_about(row(), [found(code, 5)], 5) == [found(code, 5)]
+    assert findings_about(row(), [found(code, 4)], 5) == []
+
+
+def test_findings_of_the_model_and_of_a_later_version_concern_every_image_those_of_files_none():
+    findings = [found("rounded_poses"), found("stored_errors_stale"), found("of_a_later_version")]
+    assert findings_about(row(), findings, 5) == [findings[0], findings[2]]
+
+
+def test_the_story_tells_findings_about_its_model():
+    def told(findings):
+        model = {"num_images": 5, "findings": findings}
+        config = {"policy": "standard", "min_effect": "0.2px"}
+        return render_story(Story(row(), config, "/data/m", None, {}, model=model))
+
+    text = told([found("rounded_poses", text="rounded to\x1b 6 decimals"), found("orphan_cameras")])
+    assert "\nFindings about its model" in text
+    assert "- rounded_poses: rounded to\\x1b 6 decimals\n- 1 more finding about other images" in text
+    assert "- 2 findings about other images" in told([found("orphan_cameras"), found("unseen_points")])
+    assert "Findings" not in told([])

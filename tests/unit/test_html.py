@@ -241,6 +241,9 @@ def test_the_page_says_what_to_do_and_explains_its_codes(tmp_path):
     page = Page(html.render_page(html.PageInput(html.read_content(run))))
     said = " ".join("".join(page.texts).split())
     assert f"sfm-audit diagnose {run.folder} data/<i>a" in said
+    assert said.count("3 tracks name other images") == 1
+    told = html.PageInput(html.read_content(run), pictures=[html.ImagePictures((), None)])
+    assert html.render_page(told).count("3 tracks name other images") == 2  # at the image that it concerns, too
     for words in ("lenses lack a term", "Do: refit them", "2 images, medium, such as <b>.jpg"):
         assert words in said
     assert {"code-reason-misfit_radial", "code-finding-tracks_disagree"} <= set(page.ids())
