@@ -73,7 +73,14 @@ def model_file_names(folder: InputPath) -> tuple[str, ...]:
     """
     known = tuple(dict.fromkeys(name for each in FORMATS for name in each.files))
     there = {name for name in known if "*" not in name and exists(folder / name)} if isinstance(folder, Path) else set()
-    return model_files_among(there | set(names_in(folder)))
+    names = model_files_among(there | set(names_in(folder)))
+    return (*names, *files_below(folder, names))
+
+
+def files_below(folder: InputPath, names: Collection[str]) -> tuple[str, ...]:
+    """Return the names of files in sub-folders that the model in a folder of this machine with ``names`` may need."""
+    found = next((each for each in FORMATS if each.matches(names)), None)
+    return found.below(folder) if found is not None and isinstance(folder, Path) else ()
 
 
 def marks_model(names: Collection[str]) -> bool:
@@ -125,9 +132,12 @@ def format_of(folder: InputPath) -> ModelFormat:
     raise _incomplete(folder, there)
 
 
-def files_of(folder: InputPath) -> tuple[InputPath, ...]:
-    """Return the files that the model in ``folder`` is read from, in a fixed order; errors as of `format_of`."""
-    return tuple(folder / name for name in format_of(folder).among(model_file_names(folder)))
+def files_of(folder: InputPath) -> dict[str, InputPath]:
+    """Return the files that the model in ``folder`` is read from, by name, in a fixed order; errors as of `format_of`.
+
+    A name is seen from the folder, as ``../sensors/sensors.txt``.
+    """
+    return {name: folder / name for name in format_of(folder).among(model_file_names(folder))}
 
 
 def format_named(name: str) -> ModelFormat:

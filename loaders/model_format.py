@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -41,6 +42,8 @@ class ModelFormat:
         Names of the files in a model folder. A folder with one of the required files counts as a model, so that an
         incomplete model is reported instead of passed over. A name with a ``*`` stands for all names like it; where a
         folder holds several, the reader says which it wants.
+    folders : tuple of str
+        Folders in a model folder of this machine, all files of which, at any depth, may be read for the model.
     read : callable
         Reads the model in a folder; raises `loaders.errors.LoadError` where that cannot be done.
     count_images : callable
@@ -60,6 +63,7 @@ class ModelFormat:
     read: Callable[[InputPath], RawModel]
     count_images: Callable[[InputPath], int]
     optional: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
     check: Callable[[InputPath], None] | None = None
     writer: ModelWriter | None = None
     keypoint_scales: Callable[[SparseModel, str], FloatArray] | None = None
@@ -75,7 +79,37 @@ class ModelFormat:
 
     def among(self, names: Collection[str]) -> tuple[str, ...]:
         """Return those of ``names`` that are files of this format, the required ones first."""
-        return tuple(dict.fromkeys(found for name in self.files for found in matching(name, names)))
+        inside = tuple(f"{folder}/" for folder in self.folders)
+        found = [found for name in self.files for found in matching(name, names)]
+        return tuple(dict.fromkeys([*found, *sorted(name for name in names if inside and name.startswith(inside))]))
+
+    def below(self, folder: Path) -> tuple[str, ...]:
+        """Return the names of all files in this format's folders, as ``keypoints/SIFT/1.jpg.kpt``, sorted."""
+        return tuple(sorted(name for start in self.folders for name in _files_below(folder / start, start)))
+
+
+def _files_below(folder: Path, name: str) -> list[str]:
+    """Return the files below a folder; links to folders are followed once, what cannot be listed holds none."""
+    found: list[str] = []
+    seen: set[str] = set()
+    waiting = [(folder, name)]
+    while waiting:
+        here, prefix = waiting.pop()
+        real = os.path.realpath(here)
+        if real in seen:
+            continue
+        seen.add(real)
+        try:
+            entries = list(os.scandir(here))
+        except OSError:
+            continue
+        for entry in entries:
+            below = f"{prefix}/{entry.name}"
+            if entry.is_dir():
+                waiting.append((here / entry.name, below))
+            else:
+                found.append(below)
+    return found
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_audit.audit.engine.model import ModelAuditor
-from sfm_audit.loaders import SparseModel, discover, open_model
+from sfm_audit.loaders import LoadError, SparseModel, discover, open_model
 
 
 def line_of(model: SparseModel) -> str:
@@ -37,4 +37,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="+", type=Path)
     for ref in discover(parser.parse_args().paths).refs:
-        print(f"{ref.location}\t{line_of(open_model(ref.location))}")
+        try:
+            print(f"{ref.location}\t{line_of(open_model(ref.location))}")
+        except LoadError as error:
+            print(error)

@@ -24,7 +24,7 @@ from sfm_audit.loaders.datasets.layouts import (
 )
 from sfm_audit.loaders.datasets.walk import LIMITS, Folder, leads_out, walk
 from sfm_audit.loaders.errors import LoadError, MissingFileError, UnreadableFileError
-from sfm_audit.loaders.formats import format_names, marks_model, model_files_among, without_points
+from sfm_audit.loaders.formats import files_below, format_names, marks_model, model_files_among, without_points
 from sfm_audit.loaders.paths.files import exists, is_folder, listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, below, parse_location, real_location
 
@@ -250,7 +250,8 @@ def _search_local(root: Path, layout: Layout | None, *, follow_links: bool) -> _
 def _files_out(folder: Folder, root: Path) -> list[str]:
     """Names of a model's files that are links to the outside of the PATH."""
     there = {*folder.files, *folder.folders}
-    return [name for name in model_files_among(there) if leads_out(folder.path / name, root)]
+    names = model_files_among(there)
+    return [name for name in (*names, *files_below(folder.path, names)) if leads_out(folder.path / name, root)]
 
 
 def _leads_out(folder: Path, names: list[str]) -> LoadError:

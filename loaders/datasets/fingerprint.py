@@ -16,7 +16,7 @@ _LARGE_BYTES: Final = 1 << 28  # below it, hashing takes less than a second
 
 @dataclass(frozen=True, slots=True)
 class InputFile:
-    """One file that a model was read from: its name in the model folder, its size in bytes, its SHA-256 in hex.
+    """One file that a model was read from: its name as seen from there, its size in bytes, its SHA-256 in hex.
 
     Of a file in an object store, the SHA-256 of the store's own name for this version of the content (its entity tag),
     so that asking whether it changed does not mean fetching it.
@@ -45,9 +45,12 @@ def files_in(folder: InputPath) -> tuple[InputFile, ...]:
     refused without being read to its end.
     """
     check = format_of(folder).check
-    if check is not None and isinstance(folder, Path) and any(_is_large(path) for path in files_of(folder)):
+    if check is not None and isinstance(folder, Path) and any(map(_is_large, files_of(folder).values())):
         check(folder)
-    return tuple(_remote(path) if isinstance(path, RemotePath) else _hashed(path) for path in files_of(folder))
+    return tuple(
+        _remote(path) if isinstance(path, RemotePath) else _hashed(path, name)
+        for name, path in files_of(folder).items()
+    )
 
 
 def _is_large(path: InputPath) -> bool:
@@ -59,12 +62,12 @@ def _remote(path: RemotePath) -> InputFile:
 
     num_bytes, tag = entity_tag(path)
     if tag is None:
-        return _hashed(path)
+        return _hashed(path, path.name)
     return InputFile(path.name, num_bytes, hashlib.sha256(tag.encode()).hexdigest())
 
 
-def _hashed(path: InputPath) -> InputFile:
+def _hashed(path: InputPath, name: str) -> InputFile:
     file, _ = open_input(path, may_be_empty=True)  # the reader says whether it may
     with file, reading(path):
         digest = hashlib.file_digest(file, "sha256")
-        return InputFile(path.name, file.tell(), digest.hexdigest())
+        return InputFile(name, file.tell(), digest.hexdigest())

@@ -6,12 +6,16 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from stat import S_ISDIR
+from typing import Final
 
 from sfm_audit.loaders.datasets.fingerprint import files_in
 from sfm_audit.loaders.errors import LoadError
 from sfm_audit.loaders.formats import files_read, model_file_names, model_files_among
 from sfm_audit.loaders.paths.files import listing_of
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath, parse_location
+
+_MANY: Final = 64
+"""More files than this are those of a format that keeps one per image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +79,9 @@ def input_size(location: str) -> int:
 
 
 def stamp_of(files: Mapping[str, Entry]) -> str:
-    """Return names, sizes and times of change of model files as one string."""
-    return " ".join(f"{name}:{there.num_bytes}:{there.mtime_ns}" for name, there in files.items())
+    """Return names, sizes and times of change of model files as one string, of many files a hash of it."""
+    stamp = " ".join(f"{name}:{there.num_bytes}:{there.mtime_ns}" for name, there in files.items())
+    return stamp if len(files) <= _MANY else hashlib.sha256(stamp.encode(errors="surrogateescape")).hexdigest()
 
 
 def size_of(files: Mapping[str, Entry]) -> int:

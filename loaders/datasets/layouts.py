@@ -61,24 +61,35 @@ def _phototourism(parts: Parts) -> Place | None:
 
 
 _ETH3D: Final = frozenset(
-    {"dslr_calibration_jpg", "dslr_calibration_undistorted", "rig_calibration", "rig_calibration_undistorted"}
+    {
+        *("dslr_calibration_jpg", "dslr_calibration_raw", "dslr_calibration_undistorted"),
+        *("rig_calibration", "rig_calibration_undistorted"),
+    }
 )
 
 
 def _eth3d(parts: Parts) -> Place | None:
-    """ETH3D: one model per camera system and version of the images, all of one scene."""
+    """ETH3D: one model per camera system and version of the images, all of one scene.
+
+    Sources: eth3d.net/documentation (COLMAP's text files per version of the images); folders as COLMAP's rig tutorial
+    and public loaders of the archives name them.
+    """
     return Place(parts[-2], parts[-1], 1) if len(parts) >= 2 and parts[-1] in _ETH3D else None
 
 
 def _scannetpp(parts: Parts) -> Place | None:
-    """ScanNet++: data/<scene>/dslr/colmap, data/<scene>/iphone/colmap."""
+    """ScanNet++: data/<scene>/dslr/colmap, data/<scene>/iphone/colmap (its toolbox, common/scene_release.py)."""
     if len(parts) >= 3 and parts[-1] == "colmap" and parts[-2] in {"dslr", "iphone"}:
         return Place(parts[-3], parts[-2], 2)
     return None
 
 
 def _imc(parts: Parts) -> Place | None:
-    """Image Matching Challenge 2023 (train/<dataset>/<scene>/sfm) and 2024 (train/<scene>/sfm); 2021: phototourism."""
+    """Image Matching Challenge 2023 (train/<dataset>/<scene>/sfm) and 2024 (train/<scene>/sfm); 2021: phototourism.
+
+    Public programs show ``train/<dataset>/<scene>/images`` and ``train/<scene>/images``, and a model in ``sfm`` of a
+    copy of 2023's; none that could be found shows both in one path.
+    """
     if len(parts) >= 3 and parts[-1] == "sfm" and parts[-3] == "train":
         return Place(parts[-2], ONLY_COMPONENT, 1)
     if len(parts) >= 4 and parts[-1] == "sfm" and parts[-4] == "train":
@@ -87,7 +98,11 @@ def _imc(parts: Parts) -> Place | None:
 
 
 def _visloc(parts: Parts) -> Place | None:
-    """Ground truth of visual localization: Aachen's 3D-models, hloc's models of 7Scenes and Cambridge Landmarks."""
+    """Ground truth of visual localization: Aachen's 3D-models, hloc's models of 7Scenes and Cambridge Landmarks.
+
+    Source: hloc's pipelines (3D-models/aachen_v_1_1; 7scenes_sfm_triangulated/<scene>/triangulated;
+    CambridgeLandmarks_Colmap_Retriangulated_1024px/<scene>/model_train).
+    """
     if len(parts) >= 3 and parts[-2] == "3D-models":
         return Place(parts[-3], parts[-1], 2)
     if len(parts) >= 2 and parts[-1] in {"triangulated", "model_train"}:

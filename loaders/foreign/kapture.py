@@ -41,6 +41,7 @@ SENSORS: Final = "../sensors/sensors.txt"
 RECORDS: Final = "../sensors/records_camera.txt"
 TRAJECTORIES: Final = "../sensors/trajectories.txt"
 RIGS: Final = "../sensors/rigs.txt"
+KEYPOINTS: Final = "keypoints"
 _ADVICE: Final = "check that this is kapture's format 1.1, or convert it again"
 _NO_CAMERA: Final = 2**32 - 1
 _Pose = tuple[float, ...]
@@ -200,7 +201,7 @@ class _Keypoints:
     """The files of keypoints, each read once, when an observation names it."""
 
     def __init__(self, folder: InputPath) -> None:
-        self._folder = folder / "keypoints"
+        self._folder = folder / KEYPOINTS
         self._types: dict[bytes, tuple[np.dtype[np.floating[Any]], int]] = {}
         self._found: dict[tuple[bytes, bytes], FloatArray] = {}
         self.counts: dict[str, int] = {}
@@ -260,6 +261,7 @@ KAPTURE: Final = ModelFormat(
     name="kapture",
     required=(POINTS, OBSERVATIONS),
     optional=(SENSORS, RECORDS, TRAJECTORIES, RIGS),
+    folders=(KEYPOINTS,),
     read=read,
     count_images=count_images,
 )

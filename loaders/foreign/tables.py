@@ -24,6 +24,8 @@ from sfm_audit.loaders.paths.locations import InputPath
 
 ADVICE: Final = "export the reconstruction again"
 NO_ERROR: Final = -1.0
+_MANY: Final = 50
+"""So many observations lie on all sides of the centre, if they are measured from it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +137,7 @@ def assumed_size(xy_centred: FloatArray) -> tuple[int, int, Finding]:
 
     Parameters
     ----------
-    xy_centred : (M, 2) px from the image's centre, of all images
+    xy_centred : (M, 2) px from the image's centre, of all images, y up or down
 
     Returns
     -------
@@ -146,4 +148,9 @@ def assumed_size(xy_centred: FloatArray) -> tuple[int, int, Finding]:
     reach = np.minimum(np.abs(finite).max(axis=0, initial=0.0), 2.0**30)
     width, height = (2 * max(1, int(np.ceil(value))) for value in reach)
     text = f"the format stores no image sizes; {width} x {height} px, in which all observations lie, was taken for all"
+    if len(finite) >= _MANY and (finite >= 0).all():
+        text += (
+            "; no observation lies left of the centre or above it: if the program wrote px from the corner, as COLMAP's"
+            " exporter does, subtract the principal points"
+        )
     return width, height, Finding(FindingCode.IMAGE_SIZE_ASSUMED, 1, text)

@@ -96,7 +96,7 @@ def test_the_table_is_that_of_the_same_scene_from_colmap(tmp_path, name):
 
     assert count_images(str(folder)) == len(made.rotations)
     (ref,) = discover([tmp_path / "ours"]).refs
-    assert ref.num_bytes == sum(len(content) for path, content in write(made).items() if "keypoints" not in path)
+    assert ref.num_bytes == sum(map(len, write(made).values()))
 
 
 def test_bundler_and_bal_residuals_are_their_own(tmp_path):
@@ -139,6 +139,15 @@ def test_several_models_of_one_nvm_file_are_one_table_with_a_finding(tmp_path):
     assert count_images(str(folder)) == 10
     last = model.observations.point_idx[model.observations.offsets[-2] :]
     assert last.min() >= 80
+
+
+def test_px_that_count_from_the_corner_are_suspected_where_none_is_left_of_the_centre(tmp_path):
+    made = fs.scene(PLAIN)
+    shifted = made.but(xy=made.xy + np.array([made.width / 2, made.height / 2]))
+    for name, scene, is_suspected in (("centre", made, False), ("corner", shifted, True)):
+        model = open_model(fs.write(tmp_path / name, fs.nvm_files(scene)))
+        (text,) = [each.text for each in model.findings if each.code is FindingCode.IMAGE_SIZE_ASSUMED]
+        assert ("px from the corner" in text) is is_suspected
 
 
 def test_two_nvm_files_in_a_folder_are_refused_in_one_line(tmp_path):

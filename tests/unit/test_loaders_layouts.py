@@ -25,6 +25,7 @@ KNOWN = [
     ("hloc", "outputs/demo/sfm", "demo", "sfm"),
     ("eth3d", "courtyard/dslr_calibration_undistorted", "courtyard", "dslr_calibration_undistorted"),
     ("eth3d", "courtyard/dslr_calibration_jpg", "courtyard", "dslr_calibration_jpg"),
+    ("eth3d", "pipes/dslr_calibration_raw", "pipes", "dslr_calibration_raw"),
     ("eth3d", "delivery_area/rig_calibration", "delivery_area", "rig_calibration"),
     ("scannetpp", "data/0a5c013435/dslr/colmap", "0a5c013435", "dslr"),
     ("scannetpp", "data/0a5c013435/iphone/colmap", "0a5c013435", "iphone"),
