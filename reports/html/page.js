@@ -1,19 +1,17 @@
 "use strict";
-// Connects the rows of this page with DataTables, the filters, the panel and the scene. All texts of the run reach the
-// page as text nodes or escaped.
+// The columns of the page's table, the panel of an image, and their links with the scene.
 (() => {
   const payload = JSON.parse(document.getElementById("payload").textContent);
   const byId = (id) => document.getElementById(id);
-  const NAME = 0, CODES = 1, SENTENCES = 2, CAMERA = 3, SCENE = 4, MAX_OPTIONS = 500, MAX_PRINTED = 500;
+  const NAME = 0, CODES = 1, SENTENCES = 2, CAMERA = 3, SCENE = 4;
   const factIndex = new Map(payload.facts.map((fact, i) => [fact.name, payload.firstFact + i]));
   const at = (row, name) => row[factIndex.get(name)];
-  const escape = (text) => String(text).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
-  const digits = { px: 3, number: 2 };
 
   function shown(value, kind) {
     if (value === null || value === undefined) return "-";
     if (kind === "p") return value >= 1e-3 || value === 0 ? String(+value.toPrecision(2)) : value.toExponential(0);
-    if (kind in digits) return Math.abs(value) < 1000 ? value.toFixed(digits[kind]) : value.toPrecision(3);
+    if (kind === "px") return inPx(value);
+    if (kind === "number") return Math.abs(value) < 1000 ? value.toFixed(2) : value.toPrecision(3);
     return String(value);
   }
   const photo = (i) => (payload.thumbnails[i] ? `<img class="thumb" src="${payload.thumbnails[i]}" alt="">` : "");
@@ -22,11 +20,11 @@
     return (value, type, row) => {
       if (type !== "display") return kind === "codes" ? value.join(" ") : (value ?? (type === "filter" ? "" : null));
       const i = row[row.length - 1];
-      if (kind === "name") return `<button type="button" class="open" data-row="${i}">${photo(i)}<bdi>${escape(value) || "(no name)"}</bdi></button>`;
-      if (kind === "verdict") return `<span class="badge ${escape(value)}">${escape(value)}</span>`;
-      if (kind === "codes") return escape(value.join(", ").replaceAll("_", " "));
-      if (kind === "text") return `<bdi>${escape(shown(value, kind)).replaceAll("_", "_<wbr>")}</bdi>`;
-      return escape(shown(value, kind));
+      if (kind === "name") return `<button type="button" class="open" data-row="${i}">${photo(i)}<bdi>${nameOr(value)}</bdi></button>`;
+      if (kind === "verdict") return verdictBadge(value);
+      if (kind === "codes") return escapeText(value.join(", ").replaceAll("_", " "));
+      if (kind === "text") return `<bdi>${breakable(shown(value, kind))}</bdi>`;
+      return escapeText(shown(value, kind));
     };
   }
 
@@ -42,66 +40,20 @@
     orderSequence: numeric.has(column.kind) ? ["desc", "asc"] : ["asc", "desc"],
     className: `${numeric.has(column.kind) ? "dt-type-numeric" : column.kind} rank-${column.rank}`,
   }));
-  const table = new DataTable("#images", {
-    data: payload.rows,
+  const { datasets, scenes, cameras } = payload;
+  const labels = { reason: (value) => value.replaceAll("_", " "), scene: (value) => scenes[value], camera: (value) => cameras[value] };
+  startTable({
+    rows: payload.rows,
     columns,
-    order: [],
-    autoWidth: false,
-    deferRender: true,
-    pageLength: 25,
-    layout: { topStart: "info", topEnd: "pageLength", bottomStart: null, bottomEnd: "paging" },
-  });
-
-  const scroller = byId("images").closest(".dt-layout-table");
-  for (const [name, value] of [["role", "region"], ["tabindex", "0"], ["aria-label", "Table of images"]]) scroller.setAttribute(name, value);
-
-  // filters: each asks one thing of a row
-  const asks = {
-    verdict: (row) => at(row, "verdict"),
-    reason: (row) => row[CODES],
-    dataset: (row) => datasets[row[SCENE]],
-    scene: (row) => String(row[SCENE]),
-    camera: (row) => String(row[CAMERA]),
-  };
-  const datasets = payload.datasets;
-  const labels = { reason: (value) => value.replaceAll("_", " "), scene: (value) => payload.scenes[value], camera: (value) => payload.cameras[value] };
-  const label = (ask, value) => (labels[ask] ? labels[ask](value) : value);
-  const selects = Object.fromEntries(Object.keys(asks).map((ask) => [ask, byId(`filter-${ask}`)]));
-  for (const [ask, select] of Object.entries(selects)) {
-    const found = [...new Set(payload.rows.flatMap(asks[ask]))].map((value) => [label(ask, value), value]);
-    found.sort((a, b) => a[0].localeCompare(b[0], undefined, { numeric: true }));
-    if (found.length <= MAX_OPTIONS) for (const [text, value] of found) select.add(new Option(text, value));
-    select.parentElement.hidden = found.length < 2 || found.length > MAX_OPTIONS;
-  }
-
-  function filter() {
-    const words = byId("filter-text").value.toLowerCase().split(/\s+/).filter(Boolean);
-    const wanted = Object.entries(selects).filter(([, select]) => select.value).map(([ask, select]) => [asks[ask], select.value]);
-    table.search.fixed("filters", (_, row) =>
-      wanted.every(([ask, value]) => { const has = ask(row); return Array.isArray(has) ? has.includes(value) : has === value; }) &&
-      words.every((word) => `${row[NAME]} ${payload.scenes[row[SCENE]]} ${row[CODES].join(" ")}`.toLowerCase().includes(word)));
-    table.draw();
-  }
-  function choose(ask, value) {
-    form.reset();
-    const select = selects[ask];
-    if (![...select.options].some((option) => option.value === value)) select.add(new Option(label(ask, value), value));
-    select.value = value;
-    select.parentElement.hidden = false;
-    setTimeout(filter); // after the form's own reset
-  }
-  const form = byId("filters");
-  let waiting;
-  form.addEventListener("input", () => { clearTimeout(waiting); waiting = setTimeout(filter, 120); });
-  form.addEventListener("submit", (event) => { event.preventDefault(); filter(); });
-  form.addEventListener("reset", () => setTimeout(filter));
-  document.addEventListener("click", (event) => {
-    const link = event.target.closest("a.ask");
-    if (!link) return;
-    choose(link.dataset.ask, link.dataset.value);
-    event.preventDefault();
-    byId("images-heading").scrollIntoView();
-    byId("images-heading").focus({ preventScroll: true });
+    asks: {
+      verdict: (row) => at(row, "verdict"),
+      reason: (row) => row[CODES],
+      dataset: (row) => datasets[row[SCENE]],
+      scene: (row) => String(row[SCENE]),
+      camera: (row) => String(row[CAMERA]),
+    },
+    words: (row) => `${row[NAME]} ${scenes[row[SCENE]]} ${row[CODES].join(" ")}`,
+    label: (ask, value) => (labels[ask] ? labels[ask](value) : value),
   });
 
   const dialog = byId("panel");
@@ -145,9 +97,5 @@
   byId("panel-scene").addEventListener("click", (event) => { dialog.close(); window.scene.show(opened); event.preventDefault(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
 
-  // paper shows what is open on the screen, and the rows that the filters leave
-  let length = 25;
-  window.addEventListener("beforeprint", () => { length = table.page.len(); table.page.len(MAX_PRINTED).draw(); });
-  window.addEventListener("afterprint", () => { table.page.len(length).draw(); });
   document.documentElement.dataset.ready = "true";
 })();

@@ -9,7 +9,7 @@ from importlib import resources
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from sfm_audit.audit.table.concerns import findings_about
 from sfm_audit.audit.table.thresholds import ALPHA, effect_px
@@ -22,8 +22,8 @@ from sfm_audit.reports.html.pictures import ImagePictures, Picture
 from sfm_audit.reports.html.scenes import ModelView, draw_view
 from sfm_audit.reports.html.todo import codes_of, diagnoses_of
 from sfm_audit.reports.run_folder.reader import Row
-from sfm_audit.reports.text.explain import LIMITS, plain_reason
-from sfm_audit.reports.text.reasons import reasons_of
+from sfm_audit.reports.text.explain import LIMITS, plain_reasons
+from sfm_audit.reports.text.legend import settings_words
 from sfm_audit.reports.text.witnesses import witnesses_line
 from sfm_audit.reports.text.wording import counted, number, plain, px
 
@@ -58,7 +58,7 @@ def render_page(page: PageInput) -> str:
         .render(
             run_head=_head(content),
             complete=info.get("status") == "complete",
-            config=content.config,
+            judged=_judged(content),
             totals={verdict: content.verdicts.count(verdict) for verdict in Verdict},
             num_images=content.num_images,
             decided_again=info.get("decided_again"),
@@ -106,6 +106,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters["breakable"] = _breakable
+    made.filters["coded"] = _coded
     made.globals["asset"] = lambda name: Markup(_asset(name))  # noqa: S704 - our own files
     return made
 
@@ -122,13 +123,26 @@ def _breakable(name: str) -> Markup:
     return Markup("_<wbr>").join(name.split("_"))  # join escapes the pieces
 
 
+def _coded(text: str) -> Markup:
+    """Show what stands between backticks as code; a text with an odd one stays as it is."""
+    pieces = text.split("`")
+    if len(pieces) % 2 == 0:
+        return escape(text)
+    shown = (Markup("<code>{}</code>").format(piece) if i % 2 else escape(piece) for i, piece in enumerate(pieces))
+    return Markup("").join(shown)
+
+
 def _asset(name: str) -> str:
     return resources.files("sfm_audit.reports.html").joinpath(name).read_text(encoding="utf-8")
 
 
 def _questions(content: RunContent) -> list[dict[str, Any]]:
     policy = content.config.get("policy")
-    named = [(f"policy {name}", ", ".join(member.short for member in members)) for name, members in POLICIES.items()]
+    nobody = () if Member.OUTSIDE in content.counts else (Member.OUTSIDE,)
+    named = [
+        (f"policy {name}", ", ".join(member.short for member in members if member not in nobody))
+        for name, members in POLICIES.items()
+    ]
     rows = [*named, *((str(member), question) for member, question in MEMBER_QUESTIONS.items())]
     return [
         {"name": name, "words": words, "decides": name == f"policy {policy}", **_shares(content.counts[name])}
@@ -145,6 +159,13 @@ def _shares(counts: Mapping[str, int]) -> dict[str, Any]:
 
 def _summary(content: RunContent) -> str:
     return counted(content.num_images, "image") + " in " + counted(len(content.models), "model")
+
+
+def _judged(content: RunContent) -> str:
+    """What judged the images, at which level, in words."""
+    has_witnesses = any(row["witnesses"] for row in content.models)
+    said = settings_words(content.config, has_witnesses=has_witnesses)
+    return f"{said[0].upper()}{said[1:]}."
 
 
 def _head(content: RunContent) -> dict[str, Any]:
@@ -299,7 +320,7 @@ def _worst(index: int, row: Row, pictures: ImagePictures, model: Row | None) -> 
         "name": plain(row["image_name"]),
         "place": plain(f"{row['scene']}/{row['component']}"),
         "verdict": row["verdict"],
-        "reasons": [plain_reason(reason, row) for reason in reasons_of(row)],
+        "reasons": plain_reasons(row),
         "findings": [(plain(str(finding["code"])), plain(finding["text"])) for finding in findings],
         "facts": f"{row['num_inliers']} inliers, RMS {px(row['rms_px'])} px, "
         f"predicted noise {px(row['sigma_predicted_px'])} px, coverage {number(row['coverage'])}",

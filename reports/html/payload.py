@@ -14,7 +14,7 @@ from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.words import Member
 from sfm_audit.reports.html.content import RunContent
 from sfm_audit.reports.run_folder.reader import Row
-from sfm_audit.reports.text.explain import plain_reason
+from sfm_audit.reports.text.explain import plain_reasons
 from sfm_audit.reports.text.reasons import reasons_of
 from sfm_audit.reports.text.wording import plain
 
@@ -112,7 +112,7 @@ def payload(
         [
             plain(row["image_name"]),
             _codes(row),
-            [plain_reason(reason, row) for reason in reasons_of(row)],
+            plain_reasons(row),
             places.cameras[row["part"], row["camera_id"]],
             places.scenes[row["dataset"], row["scene"]],
             *(_value(row[name]) for name in facts),

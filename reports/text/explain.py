@@ -117,6 +117,12 @@ def plain_reason(reason: Mapping[str, Any], row: Mapping[str, Any], *, where: st
     return plain(said)
 
 
+def plain_reasons(row: Mapping[str, Any]) -> list[str]:
+    """Say why the image of a row of ``RUN/images`` is judged so, remarks last and named as such."""
+    said = [(is_remark(reason["code"], row), plain_reason(reason, row)) for reason in reasons_of(dict(row))]
+    return [text for remark, text in said if not remark] + [f"Remark: {text}" for remark, text in said if remark]
+
+
 def strongest_where(xy_px: FloatArray, field_px: FloatArray, size_px: tuple[float, float]) -> str | None:
     """Say where a field (n, 2) at points (n, 2) is strongest; None where it is much the same everywhere."""
     if not len(xy_px):

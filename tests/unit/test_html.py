@@ -82,7 +82,7 @@ def nasty(tmp_path_factory):
 def test_names_are_text_and_never_elements(nasty):
     _, text = nasty
     page = Page(text)
-    assert [attrs.get("id") for tag, attrs in page.elements if tag == "script"] == ["payload", None, None, None]
+    assert [attrs.get("id") for tag, attrs in page.elements if tag == "script"] == ["payload", *[None] * 4]
     assert not [attrs for tag, attrs in page.elements if tag == "img"]
     assert not [name for _, attrs in page.elements for name in attrs if name.startswith("on")]
     names = {row[0] for row in page.payload["rows"]}
@@ -225,6 +225,12 @@ def test_the_snippets_of_the_docs_run(tmp_path, monkeypatch):
     own_table = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)[1]
     exec(own_table, {})  # noqa: S102 - our own page
     assert Path("scales.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_stands_between_backticks_is_code():
+    template = html.page.environment().from_string("{{ text | coded }}")
+    assert template.render(text="run `a <b>`, not `c`") == "run <code>a &lt;b&gt;</code>, not <code>c</code>"
+    assert template.render(text="5` <i>") == "5` &lt;i&gt;"
 
 
 def test_the_page_says_what_to_do_and_explains_its_codes(tmp_path):
