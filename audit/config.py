@@ -36,6 +36,10 @@ class AuditConfig(BaseModel):
         description="the database.db whose verified pairs are asked (docs/witnesses.md); auto: the one beside each "
         "model or up to three folders above it",
     )
+    covariance: bool = Field(
+        default=False,
+        description="whether to say how well every pose is known (columns sd_rotation_deg, sd_centre and others)",
+    )
     policy: PolicyName = Field(
         default="standard",
         description="which verdicts decide: standard = misfit, camera, pose, plausible, noise, outside; camera = the "

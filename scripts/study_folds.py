@@ -303,7 +303,7 @@ def study_photos(folder: Path) -> None:
             path = map_database(verified_again(database, Path(scratch)), Path(scratch), 2)
             after = open_model(str(path)) if path else None
         residuals = model_residuals(before)
-        depth = _median_depth(before)
+        depth = median_depth(before)
         found = against(before, after, depth) if after else None
         fold = find_fold(should_see(before, residuals))
         num_models += 1
@@ -328,7 +328,7 @@ def study_photos(folder: Path) -> None:
     )
 
 
-def _median_depth(model: SparseModel) -> float:
+def median_depth(model: SparseModel) -> float:
     """Median distance of seen points from the cameras, model units."""
     image = np.repeat(np.arange(len(model.images)), np.diff(model.observations.offsets))
     linked = model.observations.point_idx >= 0

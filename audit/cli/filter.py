@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +22,12 @@ from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderErro
 from sfm_audit.reports.export.pruned_model import MODEL_FILES, plan_pruning, write_pruned
 from sfm_audit.reports.export.scene_info import Match, drop_images, match_images, removed_table, scene_info_bytes
 from sfm_audit.reports.export.selection import (
+    POSE_SDS,
     AuditedImage,
     Keep,
     as_bytes,
     images_of_model,
+    known_to,
     list_text,
     on_side,
     read_images,
@@ -47,6 +50,20 @@ class _Request:
     keep: Keep
 
 
+class _Positive(click.FloatRange):
+    """A number above 0; NaN, which no comparison refuses, is none."""
+
+    def __init__(self) -> None:
+        super().__init__(min=0, min_open=True)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"{value} is no number above 0.", param, ctx)
+        return number
+
+
 @click.command("filter", short_help="Write lists, models and benchmark files without the rejected images.")
 @click.argument("run_folder", metavar="RUN", type=_PATH)
 @click.option(
@@ -61,6 +78,18 @@ class _Request:
     type=click.IntRange(1, 2),
     help="Keep this side of folded models (fold_group): the images of the other side go.",
 )
+@click.option(
+    "--max-rotation-sd",
+    metavar="DEG",
+    type=_Positive(),
+    help="Keep images whose rotation is known to that (sd_rotation_deg of run --covariance).",
+)
+@click.option(
+    "--max-centre-sd",
+    metavar="X",
+    type=_Positive(),
+    help="Keep images whose centre is known to that share of the median depth (sd_centre).",
+)
 @click.option("--list", "list_out", metavar="F", type=_PATH, help="Write the names of the kept images; - is stdout.")
 @click.option("--model", metavar="MODEL", type=_PATH, help="A COLMAP model that RUN audited ...")
 @click.option("--model-out", metavar="DIR", type=_PATH, help="... and where to write it without the other images.")
@@ -73,6 +102,8 @@ def command(
     run_folder: Path,
     keep: str,
     keep_group: int | None,
+    max_rotation_sd: float | None,
+    max_centre_sd: float | None,
     list_out: Path | None,
     model: Path | None,
     model_out: Path | None,
@@ -101,7 +132,9 @@ def command(
     _refuse_stdout(scene_info_out, "scene-info-out")
     given = [path for path in (run_folder, model, scene_info) if path is not None]
     _check_outputs([path for path in outputs if not is_stdout(path)], given, model_out, force)
-    request = _open(run_folder, Keep(keep), Again.of(**again), keep_group)
+    given_sds = zip(POSE_SDS, (max_rotation_sd, max_centre_sd), strict=True)
+    sds = {column: limit for column, limit in given_sds if limit is not None}
+    request = _open(run_folder, Keep(keep), Again.of(**again), keep_group, sds)
     steps: list[Callable[[], str]] = []
     if list_out is not None:
         steps.append(lambda: _write_list(request, list_out))
@@ -134,13 +167,13 @@ def _check_outputs(outputs: Sequence[Path], inputs: Sequence[Path], model_out: P
             raise KnownError(str(error), ExitCode.OUTPUT) from error
 
 
-def _open(run_folder: Path, keep: Keep, again: Again, keep_group: int | None) -> _Request:
+def _open(run_folder: Path, keep: Keep, again: Again, keep_group: int | None, sds: Mapping[str, float]) -> _Request:
     try:
         run = again.read(open_run(run_folder))
     except RunFolderError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error
     try:
-        images = read_images(run)
+        images = known_to(run, read_images(run), sds)
         return _Request(run, images if keep_group is None else on_side(run, images, keep_group), keep)
     except DamagedRunError as error:
         raise KnownError(str(error), ExitCode.UNREADABLE_INPUT) from error

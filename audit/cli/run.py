@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sfm_audit.audit.schedule.task import Limits
 
 _DEFAULTS = AuditConfig()
-_SETTINGS = ("noise", "points", "min_effect", "policy", "database")
+_SETTINGS = ("noise", "points", "min_effect", "policy", "database", "covariance")
 
 
 @click.command("run", short_help="Audit reconstructions and write the tables into a run folder.")
@@ -55,6 +55,12 @@ _SETTINGS = ("noise", "points", "min_effect", "policy", "database")
     "--database",
     metavar="DB|auto",
     help="Ask the verified pairs of this database.db, or of the one beside or above each model.",
+)
+@click.option(
+    "--covariance",
+    is_flag=True,
+    default=None,
+    help="Say how well every pose is known: sd_rotation_deg, sd_centre and others.",
 )
 @click.option(
     "--policy",

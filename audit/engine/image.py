@@ -49,6 +49,7 @@ class ImageEvidence:
     consistency, own, has_own, gains, half_pixel: see `Diagnostics`.
     expected_error_px: with the joint covariance, NaN unknown.
     implied: changes that parameters which nobody freed would take, by column.
+    pose: how well the pose is known, by column; empty where nobody asked.
     testimonies, outside: what witnesses outside of the image say of it, and what they measured, by column.
     """
 
@@ -69,6 +70,7 @@ class ImageEvidence:
     half_pixel: bool = False
     expected_error_px: float = math.nan
     implied: Mapping[str, float] = field(default_factory=dict)
+    pose: Mapping[str, object] = field(default_factory=dict)
     testimonies: tuple[WitnessStatement, ...] | None = None
     outside: Mapping[str, object] = field(default_factory=dict)
 
@@ -81,7 +83,7 @@ class ImageAudit:
     noise, tests: under the chosen noise model.          constant, constant_tests: one scale for all raw residuals.
     quality: of the camera, as the model stands; None without inliers.
     diagnostics, decision: the numbers that decide, and what was decided.
-    expected_error_px, implied, outside: see `ImageEvidence`.
+    expected_error_px, implied, outside, pose: see `ImageEvidence`.
     advised_camera_model: see `audit.misfit.advised_camera_model`.
     """
 
@@ -99,6 +101,7 @@ class ImageAudit:
     expected_error_px: float = math.nan
     implied: Mapping[str, float] = field(default_factory=dict)
     outside: Mapping[str, object] = field(default_factory=dict)
+    pose: Mapping[str, object] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         codes = ", ".join(dict.fromkeys(reason.code for reason in self.reasons))
@@ -207,6 +210,7 @@ def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
         expected_error_px=evidence.expected_error_px,
         implied=evidence.implied,
         outside=evidence.outside,
+        pose=evidence.pose,
     )
 
 

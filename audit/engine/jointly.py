@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from sfm_audit.audit.camera_quality.expected_error import expected_error_map
 from sfm_audit.audit.camera_quality.identifiability import ParameterCovariance, fitted_names
@@ -88,13 +90,35 @@ def joint_camera(camera: CameraDiagnostics, quality: CameraQuality, step: Camera
     )
 
 
-def expected_error_px(quality: CameraQuality, covariance: FloatArray, sigma_px: float, depth: float) -> float:
+def expected_error_px(quality: CameraQuality, covariance: FloatArray, sigma_px: float) -> float:
     """Return the expected error of a measurement from the joint covariance of pose and own parameters, px."""
     camera = quality.shape.camera
     if not math.isfinite(sigma_px) or not covariance.size or not math.isfinite(covariance.sum()):
         return math.nan
     parameters = ParameterCovariance(fitted_names(camera.model), covariance, 1.0)
-    return expected_error_map(camera, parameters, sigma_px, depth, rays=quality.shape.rays).median_px
+    return expected_error_map(camera, parameters, sigma_px, quality.median_depth, rays=quality.shape.rays).median_px
+
+
+def pose_columns(joint: JointAudit, image_idx: int, names: Sequence[str]) -> dict[str, object]:
+    """Return the columns of how well the pose of an image is known; none where nobody asked."""
+    if not joint.poses:
+        return {}
+    pose = joint.poses[image_idx]
+    known = math.isfinite(pose.sd_rotation_deg)
+    return {
+        "sd_rotation_deg": pose.sd_rotation_deg,
+        "sd_centre": pose.sd_centre,
+        "pose_sds": pose.sds if known else None,
+        "pose_correlations": below_diagonal(pose.correlation) if known else None,
+        "sd_neighbour": None if pose.neighbour_idx is None else names[pose.neighbour_idx],
+        "sd_rotation_rel_deg": pose.sd_rotation_rel_deg,
+        "sd_centre_rel": pose.sd_centre_rel,
+    }
+
+
+def below_diagonal(correlation: FloatArray) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
+    """Return the values below the diagonal of (q, q), row by row; masked where they are not known."""
+    return np.ma.masked_invalid(correlation[np.tril_indices(len(correlation), -1)])
 
 
 _IMPLIED_COLUMNS: Final[dict[Implied, tuple[str, ...]]] = {

@@ -27,6 +27,7 @@ from sfm_audit.audit.engine.jointly import (
     joint_camera,
     misfit_diagnostics,
     own_diagnostics,
+    pose_columns,
     untested_misfit,
 )
 from sfm_audit.audit.engine.observations import observation_table
@@ -176,6 +177,7 @@ class ModelAuditor:
             frame_idx=None if frames is None else frames.frame_idx,
             image_from_frame=None if frames is None else frames.image_from_frame,
             points_independent=self.config.points == "independent",
+            with_poses=self.config.covariance,
         )
 
     @cached_property
@@ -288,10 +290,9 @@ class ModelAuditor:
             "own": own_diagnostics(step, step.sigma_px),
             "gains": gains_of(joint, image_idx),
             "camera": joint_camera(camera_diagnostics(quality), quality, step),
-            "expected_error_px": expected_error_px(
-                quality, joint.covariances[image_idx], sigma_px, quality.median_depth
-            ),
+            "expected_error_px": expected_error_px(quality, joint.covariances[image_idx], sigma_px),
             "implied": implied_of(joint.implied, step.camera_idx),
+            "pose": pose_columns(joint, image_idx, self.model.images.name),
         }
 
     def _noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
@@ -372,9 +373,8 @@ def audit_model(
     model : from `loaders.open_model`
     config : noise model and thresholds; the defaults when None
     labels : the text columns that name the model in a dataset
-    keypoint_scale_px : see `ModelAuditor`
     observations : whether to make the table of observations too, one row per inlier
-    spread, pairs : see `ModelAuditor`
+    keypoint_scale_px, spread, pairs : see `ModelAuditor`
 
     Returns
     -------
@@ -390,8 +390,8 @@ def audit_model(
 
 def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality | None]:
     """What some images say of their cameras."""
-    sigma_px, grid = auditor.sigma_constant_px, auditor.config.grid
-    return quality_of_images(auditor.model, auditor.residuals, sigma_px, image_idxs, grid=grid)
+    sigma_px = auditor.sigma_constant_px
+    return quality_of_images(auditor.model, auditor.residuals, sigma_px, image_idxs, grid=auditor.config.grid)
 
 
 def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import Diagnostics, GroupDiagnostics, OwnDiagnostics, Worth
 from sfm_audit.audit.engine.camera import CameraAudit
 from sfm_audit.audit.engine.image import ImageAudit
-from sfm_audit.audit.engine.jointly import implied_of, own_diagnostics
+from sfm_audit.audit.engine.jointly import below_diagonal, implied_of, own_diagnostics
 from sfm_audit.audit.inliers.stored_errors import StoredErrors
 from sfm_audit.audit.joint import CameraStep, JointAudit
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
@@ -23,9 +23,9 @@ from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.columns import IMPLIED, OUTSIDE_COLUMNS, own_parameter_names
+from sfm_audit.audit.table.pose_columns import POSE_COLUMNS
 from sfm_audit.audit.table.witnesses import Witness
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
-from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
 
@@ -74,6 +74,7 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         **own_columns(audit.diagnostics.own),
         **_deciding_columns(audit.diagnostics),
         **{name: audit.implied.get(name, math.nan) for name in IMPLIED},
+        **{name: audit.pose.get(name, null) for name, null in POSE_COLUMNS.items()},
         **_outside_columns(audit),
         **verdict_columns(audit.decision),
     }
@@ -284,7 +285,7 @@ def camera_row(
         "advised_camera_model": audit.advised_camera_model,
         **own_columns(own_diagnostics(step, math.nan) if step else None),
         "own_parameters": list(step.names) if step else None,
-        "own_correlations": _below_diagonal(step.correlation) if step else None,
+        "own_correlations": below_diagonal(step.correlation) if step else None,
         **{name: implied.get(name, math.nan) for name in (*IMPLIED, *(f"{name}_sd" for name in IMPLIED))},
         "sd_focal_rel_joint": step.sd_focal_rel if step else math.nan,
         "joint_blocks": joint.num_blocks if joint else None,
@@ -327,8 +328,3 @@ def model_row(
         "witnesses": [str(each) for each in witnesses] or None,
         "findings": list(findings),
     }
-
-
-def _below_diagonal(correlation: FloatArray) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
-    """Return the values below the diagonal of (q, q), row by row; masked where they are not known."""
-    return np.ma.masked_invalid(correlation[np.tril_indices(len(correlation), -1)])

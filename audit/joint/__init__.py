@@ -6,6 +6,7 @@ from sfm_audit.audit.joint.blocks import covisible_blocks
 from sfm_audit.audit.joint.implied import Implied, ImpliedParameter, implied_parameters
 from sfm_audit.audit.joint.misfit import JointMisfit, JointTest, JointTests, joint_misfit
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from sfm_audit.audit.joint.poses import PoseCovariance, PoseGauge, pose_covariances, pose_gauge
 from sfm_audit.audit.joint.system import JointSystem, joint_system
 from sfm_audit.audit.joint.worth import Worth
 
@@ -19,6 +20,8 @@ __all__ = [
     "JointSystem",
     "JointTest",
     "JointTests",
+    "PoseCovariance",
+    "PoseGauge",
     "Worth",
     "audit_jointly",
     "covisible_blocks",
@@ -28,4 +31,6 @@ __all__ = [
     "joint_misfit",
     "joint_system",
     "own_parameters",
+    "pose_covariances",
+    "pose_gauge",
 ]

@@ -14,6 +14,7 @@ from sfm_audit.audit.joint.blocks import Block, covisible_blocks
 from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_parameters
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
+from sfm_audit.audit.joint.poses import PoseCovariance, pose_covariances, unknown_pose
 from sfm_audit.audit.joint.system import JointSystem, joint_system
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
@@ -29,6 +30,7 @@ class JointAudit:
     steps: of every camera with images in the system.    misfit: of every image.    implied: see `ImpliedParameter`.
     gains: per image.    covariances: per image, see `JointSystem.image_covariances`.
     excluded: (I,) images whose misfit was not asked for.    num_observations: (I,) that took part.
+    poses: (I,) what is known of each pose; empty where that was not asked for.
     num_blocks: more than one where the model was too large for one system; numbers are then those of blocks: a camera
     that several blocks share is told of by the block that has most of its observations, q is of the block's images.
     """
@@ -41,6 +43,7 @@ class JointAudit:
     excluded: BoolArray
     num_observations: IntArray
     num_blocks: int
+    poses: tuple[PoseCovariance, ...] = ()
 
 
 def audit_jointly(
@@ -56,6 +59,7 @@ def audit_jointly(
     image_from_frame: FloatArray | None = None,
     points_independent: bool = False,
     max_columns: int = MAX_COLUMNS,
+    with_poses: bool = False,
 ) -> JointAudit:
     """Ask the joint system everything.
 
@@ -67,6 +71,7 @@ def audit_jointly(
     left_out : (I,) images that take no part at all (section 12)
     frame_idx, image_from_frame, points_independent : see `joint_system`
     max_columns : of one dense system
+    with_poses : whether to say how well poses are known
     """
     parts = []
     for block in covisible_blocks(model, residuals, max_columns, frame_idx):
@@ -80,13 +85,19 @@ def audit_jointly(
             left_out=outside,
             points_independent=points_independent,
         )
-        parts.append(_of_block(system, block, alpha, tau_px, excluded))
+        parts.append(_of_block(system, block, alpha, tau_px, excluded, with_poses=with_poses))
         del system
     return parts[0][1] if len(parts) == 1 else _merged(parts, tau_px)
 
 
 def _of_block(
-    system: JointSystem, block: Block, alpha: float, tau_px: FloatArray, excluded: BoolArray | None
+    system: JointSystem,
+    block: Block,
+    alpha: float,
+    tau_px: FloatArray,
+    excluded: BoolArray | None,
+    *,
+    with_poses: bool,
 ) -> tuple[Block, JointAudit]:
     core = np.flatnonzero(block.core).tolist()
     covariance_of = dict(zip(core, system.image_covariances(core), strict=True))
@@ -105,7 +116,11 @@ def _of_block(
     beside = ImpliedBeside(system, steps)
     misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)
     implied = implied_parameters(system, steps, beside.found)
-    return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, counts, 1)
+    poses = [unknown_pose()] * len(block.core) if with_poses else []
+    if with_poses:
+        for image, pose in zip(core, pose_covariances(system, core, list(covariance_of.values())), strict=True):
+            poses[image] = pose
+    return block, JointAudit(steps, misfit, implied, tuple(gains), tuple(covariances), out, counts, 1, tuple(poses))
 
 
 def _merged(parts: list[tuple[Block, JointAudit]], tau_px: FloatArray) -> JointAudit:
@@ -146,4 +161,5 @@ def _merged(parts: list[tuple[Block, JointAudit]], tau_px: FloatArray) -> JointA
         np.array([found.excluded[i] for i, found in enumerate(source)]),
         np.array([found.num_observations[i] for i, found in enumerate(source)]),
         len(parts),
+        tuple(found.poses[i] for i, found in enumerate(source)) if parts[0][1].poses else (),
     )

@@ -14,8 +14,8 @@ from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 def banded_sandwiches(
     main: BandedInverse, meat: sparse.csr_array, blocks: Sequence[IntArray]
-) -> list[FloatArray] | None:
-    """Return S^+ M S^+ at each block of columns (k,); None where a block spans more than two blocks of the band.
+) -> list[FloatArray | None]:
+    """Return S^+ M S^+ at each block of columns (k,); None of those that span more than two blocks of the band.
 
     Notes
     -----
@@ -31,13 +31,14 @@ def banded_sandwiches(
     near = _near(main, ordered)
     pulled = main.factor.solve_in_order(ordered @ main.factor.solve_in_order(null))
     pull = pulled - 0.5 * null @ (null.T @ pulled)  # P Y P = Y - G H^T - H G^T
-    out = []
+    out: list[FloatArray | None] = []
     for block in blocks:
         place = band.place[block]
         number = place // band.width
         first = int(number.min()) if number.size else 0
         if number.size and number.max() - first > 1:
-            return None
+            out.append(None)
+            continue
         outer = null[place] @ pull[place].T
         values = _entries(near, place, first * band.width, first) - outer - outer.T
         out.append(values * scale[block] * scale[block][:, None])

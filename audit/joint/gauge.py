@@ -26,7 +26,7 @@ def gauge_directions(model: SparseModel, observations: JointObservations) -> Flo
     layout = observations.layout
     if observations.points_independent:
         return np.zeros((layout.num_columns, 0))
-    label = _components(observations)
+    label = components_of(observations)
     out = []
     for component in np.unique(label[label >= 0]).tolist():
         images = np.flatnonzero(label == component)
@@ -34,7 +34,7 @@ def gauge_directions(model: SparseModel, observations: JointObservations) -> Flo
     return np.hstack(out) if out else np.zeros((layout.num_columns, 0))
 
 
-def _components(observations: JointObservations) -> IntArray:
+def components_of(observations: JointObservations) -> IntArray:
     """(I,) component of each image with columns, -1 for the others."""
     layout = observations.layout
     num_images, num_points = len(layout.camera_idx), observations.num_points

@@ -88,6 +88,7 @@ class JointInverse:
     update: (D, k).    border: (D, m).    corner: (m, m).
     unidentified: (D,) parameters without effect, or with a share in a null direction that is no gauge.
     num_null: further null directions found.
+    free: (D, g) directions of the gauge, in the units of the columns.
     """
 
     main: SymmetricInverse
@@ -96,6 +97,7 @@ class JointInverse:
     corner: FloatArray
     unidentified: BoolArray
     num_null: int
+    free: FloatArray
 
     @property
     def size(self) -> int:
@@ -162,9 +164,8 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     size = matrix.shape[0]
     nothing = np.zeros((size, 0))
     if not size:
-        return JointInverse(
-            DenseInverse(np.zeros((0, 0))), nothing, nothing, np.zeros((0, 0)), np.zeros(0, dtype=bool), 0
-        )
+        empty = np.zeros((0, 0))
+        return JointInverse(DenseInverse(empty), nothing, nothing, empty, np.zeros(0, dtype=bool), 0, nothing)
     diagonal = matrix.diagonal()
     dead = diagonal <= _DEAD * before
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
@@ -188,7 +189,8 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
         main = banded_inverse(factor, inverse_scale)
     else:
         main = _dense_inverse(factor, deflated, inverse_scale)
-    return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1])
+    unscaled = free * inverse_scale[:, None]
+    return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1], unscaled)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

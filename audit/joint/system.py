@@ -123,11 +123,14 @@ class JointSystem:
         if not blocks:
             return []
         inverse, meat = self.base.inverse, score_meat(self.observations, self.base.left_px)
-        found = None
+        found: list[FloatArray | None] = [None] * len(blocks)
         if isinstance(inverse.main, BandedInverse) and not inverse.num_null:
             found = banded_sandwiches(inverse.main, meat, blocks)
+        missing = [block for block, covariance in zip(blocks, found, strict=True) if covariance is None]
+        others = _sandwiches(inverse.main, meat, missing)
         out = []
-        for block, covariance in zip(blocks, found or _sandwiches(inverse.main, meat, blocks), strict=True):
+        for block, known in zip(blocks, found, strict=True):
+            covariance = next(others) if known is None else known
             lost = inverse.unidentified[block]
             covariance[lost] = np.nan
             covariance[:, lost] = np.nan

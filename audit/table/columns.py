@@ -30,6 +30,7 @@ from sfm_audit.audit.table.kinds import (
     text,
     texts,
 )
+from sfm_audit.audit.table.pose_columns import POSE
 from sfm_audit.audit.table.words import GROUP_MEANINGS, Member, Verdict
 from sfm_audit.loaders.camera_models import CAMERA_MODELS
 
@@ -216,6 +217,7 @@ IMAGES: Final[tuple[Column, ...]] = (
     flag("folds_over", "whether the distortion folds inside the image"),
     px("expected_error_px", "expected error of a measurement with this camera and pose, median over a 16 x 16 grid"),
     px("expected_error_px_conditional", "the same, conditional on the points: a lower bound"),
+    *POSE,
     *_OUTSIDE,
     texts("witnesses", "witnesses outside of the image that said something of it; null where none was asked"),
     Column("testimonies", list_of(TESTIMONY), "text", "what they said; null where none was asked"),
@@ -327,12 +329,7 @@ TABLES: Final[dict[TableName, tuple[Column, ...]]] = {
 
 def schema(table: TableName) -> pa.Schema:
     """Return the Arrow schema of a table; each field's metadata holds its unit and meaning."""
-    return pa.schema(
-        [
-            pa.field(column.name, column.type, metadata={"unit": column.unit, "meaning": column.meaning})
-            for column in TABLES[table]
-        ]
-    )
+    return pa.schema([pa.field(column.name, column.type, metadata=column.metadata) for column in TABLES[table]])
 
 
 def empty_table(table: TableName) -> pa.Table:

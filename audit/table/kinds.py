@@ -12,12 +12,22 @@ from sfm_audit.audit.table.words import GROUP_MEANINGS
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: ``unit`` is px, deg, count, id, text, bool or 1 (a pure number); ``meaning`` is one line."""
+    """One column: ``unit`` is px, deg, count, id, text, bool or 1 (a pure number); ``meaning`` is one line.
+
+    gauge: against what a pose is known, where that matters.
+    """
 
     name: str
     type: pa.DataType
     unit: str
     meaning: str
+    gauge: str = ""
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the field of the column says in Parquet files."""
+        said = {"unit": self.unit, "meaning": self.meaning}
+        return {**said, "gauge": self.gauge} if self.gauge else said
 
 
 def text(name: str, meaning: str) -> Column:

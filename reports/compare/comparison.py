@@ -18,6 +18,7 @@ from sfm_audit.reports.run_folder.reader import Row, RunReader
 IMAGE_COLUMNS: Final = (
     *("dataset", "scene", "component", "model_path", "image_name", "camera_id", "camera_model", "num_inliers"),
     *("sigma_constant_px", "misfit_px", "pose_offset_px", "verdict", "verdict_misfit", "verdict_pose", "reasons"),
+    *("sd_rotation_deg", "sd_centre"),
     *POSE_COLUMNS,
 )
 MODEL_COLUMNS: Final = (
@@ -26,6 +27,7 @@ MODEL_COLUMNS: Final = (
 CAMERA_COLUMNS: Final = (*("dataset", "scene", "component", "model_path", "camera_id", "misfit_px", "misfit_material"),)
 _NEEDED: Final = frozenset({"dataset", "scene", "component", "model_path"})
 REJECTED: Final = "rejected"
+ACCEPTED: Final = "accepted"
 
 _ModelKey = tuple[str, str, str, str]
 
@@ -57,6 +59,8 @@ class ImageState:
     recomputed_error_px: float | None
     systematic: Systematic
     pose: StoredPose | None = None
+    sd_rotation_deg: float | None = None
+    sd_centre: float | None = None
 
     @property
     def codes(self) -> frozenset[str]:
@@ -112,6 +116,7 @@ class ScopeNumbers:
     """Numbers of one scope in one run; an image counts once, a number of a model once per image.
 
     sigma_px: median of sigma_constant_px.    noise_s0_px, recomputed_error_px: medians of the models' numbers.
+    accepted: the images that were accepted.
     """
 
     num_images: int
@@ -122,6 +127,7 @@ class ScopeNumbers:
     sigma_px: float | None
     noise_s0_px: float | None
     recomputed_error_px: float | None
+    accepted: tuple[ImageState, ...] = ()
 
     def share(self, count: int) -> float | None:
         """Return a count as a share of the images, None without images."""
@@ -258,13 +264,14 @@ def _numbers(states: Iterable[ImageState]) -> ScopeNumbers:
     codes = Counter(code for state in listed if state.verdict == REJECTED for code in state.codes)
     return ScopeNumbers(
         len(listed),
-        verdicts["accepted"],
+        verdicts[ACCEPTED],
         verdicts[REJECTED],
-        len(listed) - verdicts["accepted"] - verdicts[REJECTED],
+        len(listed) - verdicts[ACCEPTED] - verdicts[REJECTED],
         dict(sorted(codes.items())),
         _median(state.sigma_px for state in listed),
         _median(state.noise_s0_px for state in listed),
         _median(state.recomputed_error_px for state in listed),
+        tuple(state for state in listed if state.verdict == ACCEPTED),
     )
 
 
@@ -322,6 +329,8 @@ def _image_state(row: Row, model_key: _ModelKey, model: Row, camera: tuple[float
             found=(misfit * is_misfit, pose * is_moved, of_camera * is_material), seen=(misfit, pose, of_camera)
         ),
         StoredPose.of(row),
+        row.get("sd_rotation_deg"),
+        row.get("sd_centre"),
     )
 
 

@@ -12,6 +12,7 @@ from sfm_audit.reports.compare.comparison import Comparison, RunSnapshot, ScopeC
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits
 from sfm_audit.reports.compare.keys import Noted, Scope
 from sfm_audit.reports.compare.measure import Measure, pose_measures
+from sfm_audit.reports.compare.pose_limits import pose_limits
 from sfm_audit.reports.text.wording import counted
 
 NOT_MEASURED: Final = "not measured"
@@ -51,6 +52,10 @@ def judge(policy: GatePolicy, run: RunSnapshot, comparison: Comparison | None) -
         own, change = numbers.get(scope), changes.get(scope)
         limits = policy.limits_of(scope)
         checks += _limit_checks(scope, limits, own or _NOTHING, change)
+        checks += [
+            Check(scope, f"limits.{each.name}", each.passed, each.value, each.allowed, each.message, each.images)
+            for each in pose_limits(limits, own.accepted if own else ())
+        ]
     if comparison:
         for change in checked_changes(comparison):
             checks += _band_checks(change, policy.band_of(change.scope))

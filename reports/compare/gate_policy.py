@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sfm_audit.reports.compare.keys import Scope
 
 _Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-_Px = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Count = Annotated[int, Field(ge=0)]
 _Rise = Annotated[float, Field(ge=0)]  # inf: not checked
 
@@ -31,9 +31,11 @@ class Limits(_Section):
     max_share_rejected: _Share | None = None
     max_share_undetermined: _Share | None = None
     max_share_rejected_by_reason: Mapping[str, _Share] = Field(default_factory=dict)
-    max_median_sigma_px: _Px | None = None
-    max_noise_s0_px: _Px | None = None
-    max_recomputed_error_px: _Px | None = None
+    max_median_sigma_px: _Above0 | None = None
+    max_noise_s0_px: _Above0 | None = None
+    max_recomputed_error_px: _Above0 | None = None
+    max_sd_rotation_deg: _Above0 | None = None
+    max_sd_centre: _Above0 | None = None
     max_lost_images: _Count | None = None
 
 

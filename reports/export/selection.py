@@ -33,6 +33,7 @@ COLUMNS: Final = (
     "verdict",
     "reasons",
 )
+POSE_SDS: Final = ("sd_rotation_deg", "sd_centre")
 _UNWRITABLE: Final = frozenset({"Cc", "Cs", "Zl", "Zp"})  # control characters, lone surrogates, line and paragraph ends
 
 
@@ -47,7 +48,9 @@ class Keep(StrEnum):
 class AuditedImage:
     """One image of a run: what it is called, and what the audit said.
 
-    fold_group: its side, should the model be folded; None unknown.    is_on_other_side: than the one to keep.
+    fold_group: its side, should the model be folded; None unknown.
+    sd_rotation_deg, sd_centre: how well its pose is known (``run --covariance``); None unknown.
+    is_left_out: whatever its verdict: on the other side, or known less well than wanted.
     """
 
     dataset: str
@@ -59,7 +62,9 @@ class AuditedImage:
     verdict: str
     reasons: tuple[str, ...]
     fold_group: int | None = None
-    is_on_other_side: bool = False
+    sd_rotation_deg: float | None = None
+    sd_centre: float | None = None
+    is_left_out: bool = False
 
     @property
     def model(self) -> str:
@@ -68,7 +73,7 @@ class AuditedImage:
 
     def is_kept(self, keep: Keep) -> bool:
         """Whether the image stays."""
-        if self.is_on_other_side:
+        if self.is_left_out:
             return False
         return self.verdict == "accepted" if keep is Keep.ACCEPTED else self.verdict != "rejected"
 
@@ -83,7 +88,7 @@ def read_images(run: RunReader) -> tuple[AuditedImage, ...]:
     """
     if run.info.get("status") != "complete":
         raise RunFolderError(run.folder, "holds a run that was not finished", "give its command again first")
-    rows = run.rows("images", (*COLUMNS, "fold_group"))
+    rows = run.rows("images", (*COLUMNS, "fold_group", *POSE_SDS))
     images = [_image(run, row) for row in rows]
     if not images:
         raise RunFolderError(run.folder, "holds no audited image", "run it over a dataset that can be read")
@@ -115,11 +120,35 @@ def on_side(run: RunReader, images: Sequence[AuditedImage], group: int) -> tuple
         raise RunFolderError(run.folder, "holds no fold_group", advice)
     other = 3 - group
     return tuple(
-        replace(image, is_on_other_side=True, reasons=(*image.reasons, f"fold_group: {other}"))
+        replace(image, is_left_out=True, reasons=(*image.reasons, f"fold_group: {other}"))
         if image.fold_group == other
         else image
         for image in images
     )
+
+
+def known_to(run: RunReader, images: Sequence[AuditedImage], limits: Mapping[str, float]) -> tuple[AuditedImage, ...]:
+    """Leave out the images whose pose is known less well than ``limits`` (by column) say, or not known; with a reason.
+
+    Raises
+    ------
+    RunFolderError
+        The run says of no image how well its pose is known.
+    """
+    out = []
+    for image in images:
+        sds = {column: getattr(image, column) for column in limits}
+        reasons = [
+            f"{column}: not known" if sd is None else f"{column}: {sd:.3g} > {limits[column]:g}"
+            for column, sd in sds.items()
+            if sd is None or sd > limits[column]
+        ]
+        known = replace(image, is_left_out=True, reasons=(*image.reasons, *reasons)) if reasons else image
+        out.append(known)
+    if limits and all(getattr(image, column) is None for image in images for column in limits):
+        problem = f"holds no {' and no '.join(limits)}"
+        raise RunFolderError(run.folder, problem, "audit the models again with sfm-audit run --covariance")
+    return tuple(out)
 
 
 def images_of_model(run: RunReader, images: Sequence[AuditedImage], model: Path) -> tuple[AuditedImage, ...]:

@@ -330,7 +330,19 @@ def _parameter_facts(row: Mapping[str, Any], config: Mapping[str, Any]) -> list[
         ("sd of the focal length", "-" if relative is None else f"{relative:.2%}"),
         ("what freeing the camera's own parameters would gain, px", px(row.get("own_step_px"))),
         ("expected error of one measurement, px", px(row["expected_error_px"])),
+        *_pose_facts(row),
     ]
+
+
+def _pose_facts(row: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How well the pose is known, where somebody asked (``run --covariance``)."""
+    if row.get("sd_rotation_deg") is None:
+        return []
+    facts = [
+        ("sd of the rotation, of the centre in median depths", (row["sd_rotation_deg"], row["sd_centre"])),
+        ("the same against its strongest neighbour", (row["sd_rotation_rel_deg"], row["sd_centre_rel"])),
+    ]
+    return [(name, "-" if turn is None else f"{turn:.2g} deg, {centre:.2g}") for name, (turn, centre) in facts]
 
 
 def _series(row: Mapping[str, Any], show: Any, *names: str) -> str:

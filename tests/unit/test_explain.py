@@ -148,3 +148,13 @@ def test_the_story_tells_findings_about_its_model():
     assert "- rounded_poses: rounded to\\x1b 6 decimals\n- 1 more finding about other images" in text
     assert "- 2 findings about other images" in told([found("orphan_cameras"), found("unseen_points")])
     assert "Findings" not in told([])
+
+
+def test_the_story_says_how_well_the_pose_is_known_where_somebody_asked():
+    known = {"sd_rotation_deg": 0.034, "sd_centre": 0.0012, "sd_rotation_rel_deg": 0.012, "sd_centre_rel": 0.0004}
+    told, untold = (
+        render_story(Story(row(**changes), {}, "m", None, {}), 80) for changes in (known, dict.fromkeys(known))
+    )
+    assert "0.034 deg, 0.0012" in told
+    assert "0.012 deg, 0.0004" in told
+    assert "sd of the rotation" not in untold

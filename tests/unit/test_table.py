@@ -42,7 +42,7 @@ num_accepted_plausible num_rejected_plausible num_undetermined_plausible finding
 TEXT = {
     *("dataset", "scene", "component", "model_path", "image_name", "camera_model", "noise_model", "file_format"),
     *("verdict", "verdict_ks", "verdict_misfit", "verdict_pose", "plausible", "misfit_group", "advised_camera_model"),
-    *("verdict_camera", "verdict_noise", "verdict_outside", "severity"),
+    *("verdict_camera", "verdict_noise", "verdict_outside", "severity", "sd_neighbour"),
 }
 
 
@@ -69,7 +69,7 @@ def test_types_are_design_s(column):  # noqa: C901 # one branch per kind of colu
         wanted = pa.bool_()
     elif column.name in TEXT:
         wanted = pa.string()
-    elif column.name in {"params", "own_correlations"}:
+    elif column.name in {"params", "own_correlations", "pose_sds", "pose_correlations"}:
         wanted = pa.list_(pa.float64())
     elif column.name in {"reasons", "witnesses", "own_parameters"}:
         wanted = pa.list_(pa.string())
