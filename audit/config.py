@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sfm_audit.audit.table import thresholds
+from sfm_audit.audit.table import ColumnGroup, thresholds
 from sfm_audit.audit.table.words import PolicyName
 
 NoiseName = Literal["track", "constant", "keypoint"]
@@ -39,6 +39,20 @@ class AuditConfig(BaseModel):
     covariance: bool = Field(
         default=False,
         description="whether to say how well every pose is known (columns sd_rotation_deg, sd_centre and others)",
+    )
+    reference: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=4096,
+        description="poses that are known otherwise (docs/witnesses.md): a model, a tree of models, a trajectory, or a "
+        "CSV; adds the columns reference_*",
+    )
+    priors: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=4096,
+        description="position priors (docs/witnesses.md): a CSV, a database.db, or auto for the one that belongs to "
+        "each model; adds the columns prior_*",
     )
     policy: PolicyName = Field(
         default="standard",
@@ -106,6 +120,12 @@ class AuditConfig(BaseModel):
         le=256,
         description="occupied_cells counts cells of a grid x grid division of the image",
     )
+
+    @property
+    def column_groups(self) -> tuple[ColumnGroup, ...]:
+        """Which columns the images table has besides those of every run."""
+        given: dict[ColumnGroup, str | None] = {"reference": self.reference, "priors": self.priors}
+        return tuple(group for group, what in given.items() if what is not None)
 
     @model_validator(mode="after")
     def _independent_points_have_no_tracks(self) -> Self:

@@ -71,6 +71,14 @@ class FindingCode(StrEnum):
     OBSERVATIONS_WITHOUT_IMAGE = "observations_without_image"
     SEVERAL_RECONSTRUCTIONS = "several_reconstructions"
     POSSIBLE_FOLD = "possible_fold"
+    REFERENCE_NOT_USED = "reference_not_used"
+    REFERENCE_SCALE = "reference_scale"
+    REFERENCE_DRIFT = "reference_drift"
+    REFERENCE_FRAGMENTS = "reference_fragments"
+    PRIORS_NOT_USED = "priors_not_used"
+    PRIORS_SCALE = "priors_scale"
+    PRIORS_DRIFT = "priors_drift"
+    PRIORS_SPREAD = "priors_spread"
 
 
 FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
@@ -125,6 +133,14 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.RIG_POSE_DISAGREES: "poses in the images file differ from those of frames and rigs, which were read",
     FindingCode.RIG_NOT_CONSTANT: "images of a rig would move against their frame: the rig is not rigid, or misplaced",
     FindingCode.POSSIBLE_FOLD: "two groups of images side by side see different points: folded, or two times of day",
+    FindingCode.REFERENCE_NOT_USED: "the reference has nothing on the model, or no part of it fits: it was not asked",
+    FindingCode.REFERENCE_SCALE: "how long a unit of the model is in the metres of its reference",
+    FindingCode.REFERENCE_DRIFT: "neighbours in the sequence share their distance from the reference: the model bends",
+    FindingCode.REFERENCE_FRAGMENTS: "images that lie together elsewhere than the reference has them",
+    FindingCode.PRIORS_NOT_USED: "there are no position priors for the model, or too few: they were not asked",
+    FindingCode.PRIORS_SCALE: "how long a unit of the model is in the metres of its position priors",
+    FindingCode.PRIORS_DRIFT: "neighbours in the sequence share their distance from the priors: model or sensor drift",
+    FindingCode.PRIORS_SPREAD: "position priors scatter more widely about the model than their covariances say",
 }
 """One line per finding, for docs/findings.md."""
 

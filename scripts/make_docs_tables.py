@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.table import TABLES
+from sfm_audit.audit.table import TABLES, Column
+from sfm_audit.audit.table.columns import GROUP_COLUMNS
 from sfm_audit.audit.table.words import REASONS, Member, ReasonWords
 from sfm_audit.loaders.model import FINDING_MEANINGS, FindingCode
 from sfm_audit.reports.text.codes import codes_page
@@ -149,7 +151,15 @@ def table_page() -> str:
         rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(c.meaning)} |" for c in columns]
         table = "\n".join(["| column | type | unit | meaning |", "|---|---|---|---|", *rows])
         parts.append(f"## `{name}`\n\n{HEADERS[name]}\n\n{table}\n")
+        if name == "images":
+            parts += [_group(group, columns) for group, columns in GROUP_COLUMNS.items()]
     return "\n".join(parts)
+
+
+def _group(name: str, columns: Sequence[Column]) -> str:
+    rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(c.meaning)} |" for c in columns]
+    table = "\n".join(["| column | type | unit | meaning |", "|---|---|---|---|", *rows])
+    return f"### `images`, only with `--{name}`\n\n{table}\n"
 
 
 def config_page() -> str:

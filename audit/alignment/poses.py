@@ -40,6 +40,14 @@ class Poses:
         return Poses(self.rotation[idxs], self.centre[idxs])
 
 
+def camera_centres(quat_wxyz: FloatArray, translation: FloatArray) -> FloatArray:
+    """Return (n, 3) centres, world frame, of stored poses camera from world; not finite where a pose is not."""
+    with np.errstate(all="ignore"):
+        rotation = rotation_from_quat(quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True))
+        centre: FloatArray = -np.einsum("nij,ni->nj", rotation, translation)
+    return centre
+
+
 def usable_poses(quat_wxyz: FloatArray, translation: FloatArray) -> BoolArray:
     """Return which of n poses can be compared: finite, and the quaternion is not 0. Tables are not trusted."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sfm_audit.audit.schedule.task import Limits
 
 _DEFAULTS = AuditConfig()
-_SETTINGS = ("noise", "points", "min_effect", "policy", "database", "covariance")
+_SETTINGS = ("noise", "points", "min_effect", "policy", "database", "covariance", "reference", "priors")
 
 
 @click.command("run", short_help="Audit reconstructions and write the tables into a run folder.")
@@ -61,6 +61,16 @@ _SETTINGS = ("noise", "points", "min_effect", "policy", "database", "covariance"
     is_flag=True,
     default=None,
     help="Say how well every pose is known: sd_rotation_deg, sd_centre and others.",
+)
+@click.option(
+    "--reference",
+    metavar="POSES",
+    help="Compare with poses known otherwise: a model, a tree of models, a trajectory (TUM, KITTI, EuRoC), an IMC CSV.",
+)
+@click.option(
+    "--priors",
+    metavar="auto|FILE",
+    help="Ask position priors: of the database.db of each model (auto), or of a CSV or database.",
 )
 @click.option(
     "--policy",

@@ -52,6 +52,9 @@ class ComparedRun:
         ]
 
 
+_OF_THE_NIGHT = frozenset({"database", "reference", "priors"})  # what was given besides a model, each night its own
+
+
 def read_run(folder: Path, again: Again | None = None) -> ComparedRun:
     """Read a run folder, under other settings where ``again`` asks for them.
 
@@ -126,7 +129,7 @@ def different_settings(runs: Sequence[ComparedRun]) -> str | None:
     first = runs[0]
     for other in runs[1:]:
         old, new = first.info["config"], other.info["config"]
-        for name in sorted((old.keys() & new.keys()) - {"database"}):  # another night, another database
+        for name in sorted((old.keys() & new.keys()) - _OF_THE_NIGHT):
             if old[name] != new[name]:
                 return f"{other.folder} was made with {name} = {new[name]}, {first.folder} with {old[name]}"
     return None

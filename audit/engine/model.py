@@ -48,7 +48,8 @@ from sfm_audit.audit.table.words import MisfitStatus
 from sfm_audit.audit.witnesses.asking import Outside, ask
 from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, InlierSet, PairSource, SparseModel
+from sfm_audit.loaders.evidence import NOTHING_GIVEN, Given
+from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
 
 T = TypeVar("T")
 
@@ -73,10 +74,9 @@ class ModelAuditor:
     ----------
     model : from `loaders.open_model`
     config : noise model and thresholds; the defaults when None
-    keypoint_scale_px : (M,) size of the keypoint of each row of ``model.observations``, NaN where unknown; needed by
-        the noise model ``keypoint`` alone (`loaders.colmap.database`)
+    keypoint_scale_px : (M,) keypoint size of each row of ``model.observations``, NaN unknown; for noise ``keypoint``
     spread : where the stages run that look at one image at a time; the numbers do not depend on it
-    pairs : verified matches of the database that the model was made from (`loaders.colmap.pairs`); None without
+    given : what was given besides the model for witnesses to look at
     """
 
     def __init__(
@@ -86,10 +86,10 @@ class ModelAuditor:
         keypoint_scale_px: FloatArray | None = None,
         *,
         spread: Spread = in_turn,
-        pairs: PairSource | None = None,
+        given: Given = NOTHING_GIVEN,
     ) -> None:
         self.model = model
-        self._pairs = pairs
+        self._given = given
         self._spread = spread
         self.config = config or AuditConfig()
         self._keypoint_scale_px = keypoint_scale_px
@@ -98,7 +98,7 @@ class ModelAuditor:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out where images are audited: an unpickled auditor runs serially."""
-        return {**self.__dict__, "_spread": in_turn, "_pairs": None}
+        return {**self.__dict__, "_spread": in_turn, "_given": NOTHING_GIVEN}
 
     @cached_property
     def residuals(self) -> ModelResiduals:
@@ -183,7 +183,7 @@ class ModelAuditor:
     @cached_property
     def outside(self) -> Outside:
         """What witnesses outside of the images say."""
-        return ask(Evidence(self.model, self.residuals, self.sigma_constant_px, self._pairs))
+        return ask(Evidence.of(self.model, self.residuals, self.sigma_constant_px, self._given))
 
     @cached_property
     def steps(self) -> dict[int, CameraStep]:
@@ -349,7 +349,7 @@ class ModelAuditor:
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions, asked)
         row["diagnoses"] = triage(rows, cameras, labels.model_path)
         return ModelAudit(
-            images_table(rows),
+            images_table(rows, self.config.column_groups),
             table_of("cameras", cameras),
             table_of("models", [row]),
             self.observations(labels) if observations else None,
@@ -364,7 +364,7 @@ def audit_model(
     *,
     observations: bool = False,
     spread: Spread = in_turn,
-    pairs: PairSource | None = None,
+    given: Given = NOTHING_GIVEN,
 ) -> ModelAudit:
     """Audit all images of a model.
 
@@ -374,7 +374,7 @@ def audit_model(
     config : noise model and thresholds; the defaults when None
     labels : the text columns that name the model in a dataset
     observations : whether to make the table of observations too, one row per inlier
-    keypoint_scale_px, spread, pairs : see `ModelAuditor`
+    keypoint_scale_px, spread, given : see `ModelAuditor`
 
     Returns
     -------
@@ -384,7 +384,7 @@ def audit_model(
     # Matrices are small here: a second BLAS thread only waits for the first, and on a busy machine that costs 10 x.
     # Odd numbers end as NaN and undetermined; what numpy says about them on the way is nothing for the terminal.
     with threadpool_limits(limits=1, user_api="blas"), np.errstate(all="ignore"):
-        auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread, pairs=pairs)
+        auditor = ModelAuditor(model, config, keypoint_scale_px, spread=spread, given=given)
         return auditor.tables(labels, observations=observations)
 
 

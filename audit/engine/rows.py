@@ -77,6 +77,7 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         **{name: audit.pose.get(name, null) for name, null in POSE_COLUMNS.items()},
         **_outside_columns(audit),
         **verdict_columns(audit.decision),
+        **{name: value for name, value in audit.outside.items() if name not in OUTSIDE_COLUMNS},
     }
 
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from sfm_audit.audit.engine.rows import Row
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
-from sfm_audit.audit.table import TableName, build_table, empty_table, schema
+from sfm_audit.audit.table import ColumnGroup, TableName, build_table, empty_table, schema
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,17 +35,17 @@ class ModelAudit:
         return tables if self.observations is None else {**tables, "observations": self.observations}
 
 
-def images_table(rows: Sequence[Row]) -> pa.Table:
-    """Return the table of images; q-values need all of a model."""
+def images_table(rows: Sequence[Row], groups: Sequence[ColumnGroup] = ()) -> pa.Table:
+    """Return the table of images; q-values need all of a model. groups: columns that only some runs have."""
     if rows:
         q = benjamini_hochberg(np.array([row["ks_p"] for row in rows], dtype=np.float64))
         for row, value in zip(rows, q, strict=True):
             row["ks_q"] = value
-    return table_of("images", rows)
+    return table_of("images", rows, groups)
 
 
-def table_of(name: TableName, rows: Sequence[Row]) -> pa.Table:
+def table_of(name: TableName, rows: Sequence[Row], groups: Sequence[ColumnGroup] = ()) -> pa.Table:
     """Return the table with these rows."""
     if not rows:
-        return empty_table(name)
-    return build_table({column: [row[column] for row in rows] for column in rows[0]}, schema(name))
+        return empty_table(name, groups)
+    return build_table({column: [row[column] for row in rows] for column in rows[0]}, schema(name, groups))

@@ -27,6 +27,7 @@ from sfm_audit.audit.schedule.task import (
     Task,
     Unchanged,
     audit_one,
+    evidence_of,
     too_large,
 )
 from sfm_audit.loaders import LoadError, ModelRef
@@ -107,7 +108,7 @@ def audit_many(
     """
     tasks = [
         Task(ref, config, digest, observations, limits=limits)
-        for ref, digest in _unfinished(refs, sink, on_skip or on_done, verify=verify)
+        for ref, digest in _unfinished(refs, config, sink, on_skip or on_done, verify=verify)
     ]
     with closing(_outcomes(tasks, jobs, audit, dask)) as outcomes:  # an error in the sink ends the processes at once
         failures = _hand_over(outcomes, sink, on_done, on_failure)
@@ -115,11 +116,13 @@ def audit_many(
 
 
 def _unfinished(
-    refs: Sequence[ModelRef], sink: Sink, on_skip: Callable[[ModelRef], None], *, verify: bool
+    refs: Sequence[ModelRef], config: AuditConfig, sink: Sink, on_skip: Callable[[ModelRef], None], *, verify: bool
 ) -> Iterator[tuple[ModelRef, str | None]]:
     """Models that need an audit, each with the digest of the input that it was finished with, None if it never was."""
     for ref in refs:
         known = sink.finished(ref)
+        if known is not None and known.evidence != evidence_of(ref, config):
+            known = None  # another database, reference or priors: the same files of the model say something else
         if known is not None and not verify and _is_untouched(ref, known):
             on_skip(ref)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import pyarrow as pa
@@ -15,7 +15,12 @@ from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders import LoadError, ModelRef, open_model
 from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
+from sfm_audit.loaders.evidence import Given
 from sfm_audit.loaders.formats import keypoint_scales_of, verified_pairs_of
+from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.references.formats import reference_of
+from sfm_audit.loaders.references.positions import priors_of
+from sfm_audit.loaders.references.state import evidence_state
 
 FailureKind = Literal["unreadable", "too_large", "memory", "time", "died", "error"]
 
@@ -102,21 +107,36 @@ def audit_one(task: Task) -> Outcome:
     ref = task.ref
     with image_processes(task.num_processes) as spread:  # they start while the model is read
         try:
-            state = read_input_state(ref.location)
+            state = replace(read_input_state(ref.location), evidence=evidence_of(ref, task.config))
             if state.digest == task.known_digest:
                 return Unchanged()
             model = open_model(ref.location)
             scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
-            pairs = verified_pairs_of(model, task.config.database, ref.model_path)
+            given = _given(task, model)
         except LoadError as error:
             return Failure(ref.model_path, str(error))
         except MemoryError:
             return _too_large_to_read(task)
         labels = ModelLabels(ref.dataset, ref.scene, ref.component, ref.model_path)
         audited = audit_model(
-            model, task.config, labels, scale_px, observations=task.observations, spread=spread, pairs=pairs
+            model, task.config, labels, scale_px, observations=task.observations, spread=spread, given=given
         )
     return Audited(state, audited.tables, time.perf_counter() - start)
+
+
+def _given(task: Task, model: SparseModel) -> Given:
+    """Read what the settings name besides the model; LoadError where that cannot be read."""
+    config, ref = task.config, task.ref
+    return Given(
+        verified_pairs_of(model, config.database, ref.model_path),
+        reference_of(model, config.reference, ref.below, ref.scene) if config.reference is not None else None,
+        priors_of(model, config.priors, ref.model_path) if config.priors is not None else None,
+    )
+
+
+def evidence_of(ref: ModelRef, config: AuditConfig) -> str:
+    """Return the state of what the settings name besides the model."""
+    return evidence_state(ref.location, ref.below, config.database, config.reference, config.priors)
 
 
 def too_large(task: Task) -> Failure:

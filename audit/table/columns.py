@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -133,6 +134,24 @@ _OUTSIDE: Final = (
     number("fold_score", "of the model: share of common points that close images of different fold_group lack"),
     count("fold_group", "1 or 2: side of the image if the model is folded; null where no sides can be told apart"),
 )
+ColumnGroup = Literal["reference", "priors"]
+
+GROUP_COLUMNS: Final[dict[ColumnGroup, tuple[Column, ...]]] = {
+    "reference": (
+        number("reference_centre_error", "distance of its centre from the reference's, in units of the reference"),
+        number("reference_centre_rel", "the same in median depths of the model"),
+        Column("reference_rotation_deg", pa.float64(), "deg", "angle between its rotation and the reference's"),
+        count("reference_fragment", "0 the main group, 1.. images that moved together; null alone or not known"),
+    ),
+    "priors": (
+        number("prior_distance", "distance of its centre from its position prior, in units of the priors (m of GPS)"),
+        number("prior_chi2", "its square in units of the covariance, the fit's share taken into account"),
+        number("prior_p", "p-value of prior_chi2: chi^2 with 3 degrees of freedom"),
+        number("prior_q", "Benjamini-Hochberg q-value of prior_p over the model's images"),
+    ),
+}
+"""Columns of the images table that exist only where a reference (--reference) or priors (--priors) were given."""
+
 OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.type == pa.float64() else None for column in _OUTSIDE}
 """What witnesses outside of the image measure, and what stands there where they measured nothing."""
 
@@ -327,12 +346,19 @@ TABLES: Final[dict[TableName, tuple[Column, ...]]] = {
 }
 
 
-def schema(table: TableName) -> pa.Schema:
-    """Return the Arrow schema of a table; each field's metadata holds its unit and meaning."""
-    return pa.schema([pa.field(column.name, column.type, metadata=column.metadata) for column in TABLES[table]])
+def schema(table: TableName, groups: Collection[ColumnGroup] = ()) -> pa.Schema:
+    """Return the Arrow schema of a table; each field's metadata holds its unit and meaning.
+
+    groups: of the images table, which columns it has besides those that are always there.
+    """
+    columns = [
+        *TABLES[table],
+        *(column for group in GROUP_COLUMNS if group in groups for column in GROUP_COLUMNS[group]),
+    ]
+    return pa.schema([pa.field(column.name, column.type, metadata=column.metadata) for column in columns])
 
 
-def empty_table(table: TableName) -> pa.Table:
+def empty_table(table: TableName, groups: Collection[ColumnGroup] = ()) -> pa.Table:
     """Return a table without rows."""
-    wanted = schema(table)
+    wanted = schema(table, groups)
     return build_table({name: [] for name in wanted.names}, wanted)

@@ -264,4 +264,44 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
         "Compare with another reconstruction (check --baseline) or ask a database; filter --keep-group keeps a side.",
         "That the model is folded: one in five right models of real photos looks so.",
     ),
+    FindingCode.REFERENCE_NOT_USED: Guidance(
+        "The reference of other images, names that do not fit it, or poses of another body than the camera.",
+        "Name the reference of these photos with --reference, or leave the option out.",
+        "Anything about the reference: it was not asked.",
+    ),
+    FindingCode.REFERENCE_SCALE: Guidance(
+        "A reconstruction from photos alone has no scale; a metric one says 1 here.",
+        "Nothing, unless the model was meant to be metric: then look at its scale bars, rig or priors.",
+        "That the model is wrong: only its unit is another one.",
+    ),
+    FindingCode.REFERENCE_DRIFT: Guidance(
+        "A long sequence without loops, a focal length that is a little off, rolling shutter; a reference that drifts.",
+        "Close loops, use control points or priors in the adjustment; compare with a second reference.",
+        "Which of the two bends.",
+    ),
+    FindingCode.REFERENCE_FRAGMENTS: Guidance(
+        "A fold, a part glued on by few matches, two components merged by a wrong transformation.",
+        "Look at the matches between the fragment and the rest; or reconstruct the parts one by one.",
+        "That the smaller group is the wrong one.",
+    ),
+    FindingCode.PRIORS_NOT_USED: Guidance(
+        "A database without priors, photos without GPS, names that do not fit, fewer than six priors.",
+        "Name them with --priors, or leave the option out.",
+        "Anything about priors: none were asked.",
+    ),
+    FindingCode.PRIORS_SCALE: Guidance(
+        "A reconstruction from photos alone has no scale; a metric one says 1 here.",
+        "Nothing, unless the model was meant to be metric: then look at its scale bars or rig.",
+        "That the model is wrong: only its unit is another one.",
+    ),
+    FindingCode.PRIORS_DRIFT: Guidance(
+        "A long strip that bends (a bowl or a banana), or GPS whose error changes slowly, as it mostly does.",
+        "Compare the length with the accuracy of the sensor; adjust with priors or control points.",
+        "Which of the two drifts: errors of GPS are alike for minutes.",
+    ),
+    FindingCode.PRIORS_SPREAD: Guidance(
+        "Covariances that are too small, a lever arm between antenna and camera, clocks that differ, a bent model.",
+        "Give covariances that hold; they are taken as that much larger here.",
+        "That single images are wrong: those are judged by the spread of all.",
+    ),
 }

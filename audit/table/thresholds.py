@@ -73,6 +73,15 @@ MIN_STRONG_PAIRS: Final = 3
 """Pairs from which on an image is spoken of: one contradicted pair does not say which of its two images is wrong."""
 MAX_CONTRADICTING_SHARE: Final = 0.5
 """Share of an image's pairs above which another place would satisfy more of them than its own."""
+MAX_REFERENCE_CENTRE: Final = 0.1
+MAX_REFERENCE_ROTATION_DEG: Final = 2.0
+"""An image disagrees with its reference above so many median depths, or so many degrees (docs/witnesses.md)."""
+MIN_DRIFT: Final = 0.01
+"""Median depths that neighbours share of their distance from a reference, from which on that is a finding."""
+MAX_PRIOR_CHI2: Final = 11.344866730144373
+"""99 % point of chi^2 with 3 degrees of freedom: an image nearer to its position prior never disagrees."""
+MAX_PRIOR_SPREAD: Final = 1.5
+"""Priors that scatter so many times as widely as their covariances say are a finding."""
 
 
 def effect_px(min_effect: str, sigma_px: float | None) -> float | None:

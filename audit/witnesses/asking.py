@@ -11,13 +11,22 @@ from sfm_audit.audit.witnesses.connectivity import ask_connectivity
 from sfm_audit.audit.witnesses.evidence import Evidence, WitnessReport
 from sfm_audit.audit.witnesses.fold import ask_fold
 from sfm_audit.audit.witnesses.pairs import ask_pairs
+from sfm_audit.audit.witnesses.priors import ask_priors
+from sfm_audit.audit.witnesses.reference import ask_reference
 from sfm_audit.audit.witnesses.rigs import ask_rigs
 from sfm_audit.loaders.model import Finding
 
 AskedFunction = Callable[[Evidence], WitnessReport | None]
 """Returns None where the evidence that it needs was not given."""
 
-ASKED: Final[tuple[AskedFunction, ...]] = (ask_pairs, ask_connectivity, ask_fold, ask_rigs)
+ASKED: Final[tuple[AskedFunction, ...]] = (
+    ask_pairs,
+    ask_connectivity,
+    ask_fold,
+    ask_rigs,
+    ask_reference,
+    ask_priors,
+)
 """All that are asked, in the order in which their findings are listed."""
 
 

@@ -18,6 +18,12 @@ TABLES: Final[Tables] = {"images": ("image_id", "name"), "keypoints": ("image_id
 """What is read of keypoints."""
 PAIR_TABLES: Final[Tables] = {**TABLES, "two_view_geometries": ("pair_id", "rows", "cols", "data", "config")}
 """What is read of verified pairs."""
+_PRIOR: Final = ("position", "position_covariance", "coordinate_system")
+PRIOR_TABLES: Final[tuple[Tables, ...]] = (
+    {"images": TABLES["images"], "pose_priors": ("corr_data_id", "corr_sensor_type", *_PRIOR)},
+    {"images": TABLES["images"], "pose_priors": ("image_id", *_PRIOR)},
+)
+"""What is read of position priors: as they are stored since rigs, and before."""
 
 _STEPS: Final = (10_000_000, 16)  # of SQLite's machine: this many, and so many per byte of the file
 _STEPS_PER_CALL: Final = 10_000

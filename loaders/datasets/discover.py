@@ -43,6 +43,7 @@ class ModelRef:
     stamp: `input_stamp` when the model was found in an object store; empty for local models, which
     are asked again at no cost.
     layout: name of the rule that gave scene and component, see `layouts.LAYOUTS`.
+    below: the path from the PATH that the user gave to the folder, with slashes; empty where it is the folder.
     """
 
     dataset: str
@@ -53,6 +54,7 @@ class ModelRef:
     num_bytes: int = field(default=0, compare=False)
     stamp: str = field(default="", compare=False, repr=False)
     layout: str = field(default="", compare=False)
+    below: str = field(default="", compare=False)
 
     @property
     def key(self) -> str:
@@ -178,9 +180,9 @@ def _check_root(root: InputPath) -> None:
 
 def _ref(dataset: str, place: Place, model_path: str, found: _Found) -> ModelRef:
     location = real_location(model_path)
-    return ModelRef(
-        dataset, place.scene, place.component, location, model_path, found.num_bytes, found.stamp, place.layout
-    )
+    below_it = "/".join(found.parts)
+    names = dataset, place.scene, place.component
+    return ModelRef(*names, location, model_path, found.num_bytes, found.stamp, place.layout, below_it)
 
 
 def _nothing_found(given: str, root: InputPath, left_out: Sequence[ModelRef], layout: Layout | None) -> LoadError:

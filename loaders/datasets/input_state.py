@@ -25,11 +25,13 @@ class InputState:
     num_bytes : size of the files that the model is read from
     stamp : names, sizes and times of change of all files in the folder that can matter; equal: nothing was touched
     digest : SHA-256 over the content of the files that the model is read from (and the stamps of the others)
+    evidence : the state of what was given besides the model (`loaders.references.state`); empty without
     """
 
     num_bytes: int
     stamp: str
     digest: str
+    evidence: str = ""
 
 
 def input_stamp(location: str) -> str:

@@ -35,7 +35,10 @@ def test_defaults_then_file_then_command_line(tmp_path):
     ("text", "words"),
     [
         ("alhpa = 0.1", "unknown setting alhpa, did you mean alpha?"),
-        ("colour = 1", "unknown setting colour; expected one of noise, points, database, policy, min_effect, alpha"),
+        (
+            "colour = 1",
+            "unknown setting colour; expected one of noise, points, database, covariance, reference",
+        ),
         ('alpha = "small"', "alpha: expected a valid number, found 'small'"),
         ("alpha = 1.5", "alpha: expected less than 1, found 1.5"),
         ("min_observations = 20.5", "min_observations: expected a valid integer, found 20.5"),

@@ -22,6 +22,7 @@ from sfm_audit.audit.witnesses.pairs import ask_pairs, contradiction_p, pairs_re
 from sfm_audit.audit.witnesses.seam import seam_of
 from sfm_audit.loaders.colmap.pairs import RefusedPairs
 from sfm_audit.loaders.errors import MissingFileError
+from sfm_audit.loaders.evidence import Given
 from sfm_audit.loaders.model import FindingCode
 
 SPEC = SceneSpec(num_images=10, points_per_image=500, noise=NoiseSpec(sigma_px=0.5))
@@ -67,12 +68,12 @@ def test_a_database_that_cannot_be_used_is_a_finding_and_no_pass(model):
     report = ask_pairs(evidence_of(model, RefusedPairs(reason)))
     assert (report.witness, report.testimonies) == (None, ())
     assert [(f.code, f.text) for f in report.findings] == [(FindingCode.DATABASE_NOT_USED, str(reason))]
-    tables = ModelAuditor(model, pairs=RefusedPairs(reason)).tables()
+    tables = ModelAuditor(model, given=Given(RefusedPairs(reason))).tables()
     assert tables.images["verdict_outside"].null_count == tables.images["witnesses"].null_count == 10
 
 
 def test_a_sound_model_agrees_with_its_pairs(model):
-    tables = ModelAuditor(model, pairs=OwnPairs(model)).tables()
+    tables = ModelAuditor(model, given=Given(OwnPairs(model))).tables()
     images, models = tables.images.to_pylist(), tables.models.to_pylist()
     assert {row["verdict_outside"] for row in images} == {"accepted"}
     assert models[0]["witnesses"] == ["pairs"]
@@ -83,7 +84,7 @@ def test_a_sound_model_agrees_with_its_pairs(model):
 
 def test_a_moved_camera_is_named_and_its_neighbours_are_not(model):
     moved = moved_image(model, 3, 1.0)
-    tables = ModelAuditor(moved, pairs=OwnPairs(moved)).tables()
+    tables = ModelAuditor(moved, given=Given(OwnPairs(moved))).tables()
     verdicts = tables.images["verdict_outside"].to_pylist()
     assert verdicts[3] in {"undetermined", "rejected"}
     assert set(verdicts[:3] + verdicts[4:]) == {"accepted"}
