@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import ExitStack
 from functools import partial
@@ -14,6 +15,7 @@ from tqdm import tqdm
 from sfm_audit.audit.cli.diagnose_json import diagnosis_bytes, model_as_json
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.runs import open_run, write_file
+from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.terminal import is_stdout, print_page, terminal_page
 from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.diagnoses import DiagnosisCode
@@ -54,6 +56,8 @@ def command(  # one parameter per option
     """
     _refuse(wanted, refit, out)
     json_file: Path | None = output["json_file"]
+    if json_file is not None and json_file.is_dir():
+        raise KnownError(f"{json_file}: is a folder; name a file for --json", ExitCode.USAGE)
     quiet, is_page_aside = bool(output["quiet"]), is_stdout(json_file)
     try:
         run = open_run(run_folder, quiet=quiet)
@@ -82,9 +86,12 @@ def command(  # one parameter per option
 def _refuse(wanted: tuple[str, ...], refit: bool | None, out: Path | None) -> None:
     unknown = [name for name in wanted if name not in BY_NAME]
     if unknown:
-        raise KnownError(f"--as {unknown[0]}: no camera model; one of {', '.join(BY_NAME)}", ExitCode.USAGE)
+        hint = did_you_mean(unknown[0], BY_NAME) or f"; one of {', '.join(BY_NAME)}"
+        raise KnownError(f"--as {plain(unknown[0])}: no camera model{hint}", ExitCode.USAGE)
     if out is not None and len(wanted) != 1:
         raise KnownError("--out takes one --as CAMERA_MODEL: the model that is written", ExitCode.USAGE)
+    if out is not None and os.path.lexists(out) and not (out.is_dir() and not any(out.iterdir())):
+        raise KnownError(f"{out}: exists; choose a new folder with --out", ExitCode.USAGE)
     if refit is False and (wanted or out is not None):
         raise KnownError("--no-refit contradicts --as and --out", ExitCode.USAGE)
 
@@ -130,6 +137,10 @@ def _diagnose(
     )
     with threadpool_limits(limits=1, user_api="blas"), ExitStack() as stack:
         found = diagnose(out=None if out is None else stack.enter_context(new_folder(out)))
+        failed = [each.problem for each in found.refits[1:] if each.problem is not None]
+        if out is not None and (failed or not found.refits):
+            problem = failed[0] if failed else found.conclusion
+            raise KnownError(f"{out}: nothing was written: {problem}", ExitCode.OUTPUT)
     return model_as_json(row, found, None)
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
-
 import click
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
+from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.table.guidance import SECTIONS, sections_of
 from sfm_audit.reports.text.codes import render_sections
-from sfm_audit.reports.text.wording import paragraph
+from sfm_audit.reports.text.wording import paragraph, plain
 
 
 @click.command("explain-code", short_help="Say what a reason code or finding means, and what to do.")
@@ -29,8 +28,7 @@ def command(*, code: str | None) -> ExitCode:
         return ExitCode.OK
     found = sections_of(code)
     if not found:
-        close = difflib.get_close_matches(code, [each.code for each in SECTIONS], n=1)
-        hint = f"did you mean {close[0]}?" if close else "without a code, explain-code lists all"
-        raise KnownError(f"{code}: no such reason or finding; {hint}", ExitCode.USAGE)
+        hint = did_you_mean(code, [each.code for each in SECTIONS]) or "; without a code, explain-code lists all"
+        raise KnownError(f"{plain(code)}: no such reason or finding{hint}", ExitCode.USAGE)
     print_page(render_sections(found, page.width).rstrip("\n"))
     return ExitCode.OK

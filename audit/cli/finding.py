@@ -15,6 +15,7 @@ from sfm_audit.loaders.datasets.image_counts import count_images_of
 from sfm_audit.loaders.datasets.layouts import LAYOUTS
 from sfm_audit.loaders.datasets.selection import Selection, read_scene_list, select
 from sfm_audit.loaders.paths.locations import parse_location
+from sfm_audit.reports.run_folder.record import RUN_JSON
 from sfm_audit.reports.text.wording import plain
 
 UNKNOWN: Final = "-"
@@ -88,7 +89,7 @@ def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
     Raises
     ------
     KnownError
-        A PATH is a URI that means nothing here, or holds a secret.
+        A PATH is a URI that means nothing here, or holds a secret; or it is a run folder.
     """
     for path in paths:
         try:
@@ -96,9 +97,34 @@ def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
         except LoadError as error:
             raise KnownError(str(error), ExitCode.USAGE) from error
     found = select(discover(paths, wanted.layout, follow_links=wanted.follow_links), wanted.selection)
+    for path in paths:
+        if not found.refs and (Path(path) / RUN_JSON).is_file():
+            said = "is the folder of a run and holds no models; report, diagnose, filter and check read it"
+            raise KnownError(f"{path}: {said}", ExitCode.UNREADABLE_INPUT)
     for note in found.notes:
         click.echo(f"sfm-audit: {plain(note)}", err=True)
     return found
+
+
+def refuse_lost_database(database: str | None) -> None:
+    """Refuse a database of this machine that is not there, once and not for every model.
+
+    Raises
+    ------
+    KnownError
+        There is no such file; one in an object store is asked when it is read.
+    """
+    if database in {None, "auto"}:
+        return
+    try:
+        path = parse_location(str(database))
+    except LoadError as error:
+        raise KnownError(f"--database: {error}", ExitCode.USAGE) from error
+    if isinstance(path, Path) and not path.exists():
+        raise KnownError(f"--database {database}: there is no such file; check the path", ExitCode.UNREADABLE_INPUT)
+    if isinstance(path, Path) and path.is_dir():
+        problem = "is a folder; name the database.db in it, or auto"
+        raise KnownError(f"--database {database}: {problem}", ExitCode.UNREADABLE_INPUT)
 
 
 def listed(found: Discovery) -> tuple[list[str], list[str]]:

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from sfm_audit.audit.cli.errors import ExitCode, complain
-from sfm_audit.audit.cli.finding import CHOICE_OF_MODELS, find_models, listed, wanted_of, with_choice_of_models
+from sfm_audit.audit.cli.finding import (
+    CHOICE_OF_MODELS,
+    find_models,
+    listed,
+    refuse_lost_database,
+    wanted_of,
+    with_choice_of_models,
+)
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.cli.terminal import print_page, write_stdout
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
@@ -122,6 +129,7 @@ def command(  # one parameter per option
     in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
     config = read_config(config_file, {name: options[name] for name in _SETTINGS})
+    refuse_lost_database(config.database)
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
     if options["only_list"] and options["as_json"]:
         raise click.UsageError("--list and --json exclude each other; --list is a table with tabs.")

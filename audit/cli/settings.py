@@ -67,7 +67,7 @@ def _problem(detail: ErrorDetails, place: Callable[[str], str]) -> str:
         hint = did_you_mean(name, known) or f"; expected one of {', '.join(known)}"
         return f"{where}unknown setting {name}{hint}"
     wanted = detail["msg"].removeprefix("Input should be ")
-    if detail["type"] == "string_pattern_mismatch":
+    if name in _PATTERNS:
         wanted = _PATTERNS[name]
     return f"{place(name)}: expected {wanted}, found {shown(detail['input'])}"
 

@@ -45,14 +45,17 @@ def read_toml(file: Path) -> dict[str, Any]:
     """
     try:
         content = b"" if _is_null(file) else read_plain(file, MAX_BYTES)
-        text = content.decode()
+        text = content.decode("utf-8-sig")  # some editors begin a file with a byte order mark
         problem = _too_much(text)
         if problem:
             raise KnownError(f"{file}: {problem}; write a smaller file", ExitCode.USAGE)
         return tomllib.loads(text)
     except OSError as error:
         raise KnownError(f"{file}: cannot be read ({error.strerror or error})", ExitCode.USAGE) from error
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of too many digits
+    except UnicodeDecodeError as error:
+        problem = f"byte {error.start} is not UTF-8; save it as UTF-8"
+        raise KnownError(f"{file}: not a TOML file: {problem}", ExitCode.USAGE) from error
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, numbers of too many digits
         raise KnownError(f"{file}: not a TOML file: {str(error)[:_SHOWN]}", ExitCode.USAGE) from error
 
 

@@ -173,8 +173,10 @@ def _check_root(root: InputPath) -> None:
     """Raise unless ``root`` is a folder; the listing comes first: its errors are more specific (no such bucket)."""
     if (isinstance(root, RemotePath) and listing_of(root)) or is_folder(root):
         return
-    if exists(root.resolve() if isinstance(root, Path) else root):
-        raise UnreadableFileError(str(root), None, "a folder", "a file", "name the folder that holds the model")
+    real = Path(os.path.realpath(root)) if isinstance(root, Path) else root
+    if exists(real):
+        got = "a circle of links" if isinstance(real, Path) and real.is_symlink() else "a file"
+        raise UnreadableFileError(str(root), None, "a folder", got, "name the folder that holds the model")
     raise MissingFileError(str(root), None, "a folder", "nothing", "check the path")
 
 

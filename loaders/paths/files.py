@@ -21,7 +21,7 @@ from sfm_audit.loaders.errors import (
 from sfm_audit.loaders.paths.locations import Entry, InputPath, RemotePath
 
 LFS_PREFIX: Final = b"version https://git-lfs.github.com/spec/"
-_COPY_AGAIN: Final = "copy or export the reconstruction again"
+_COPY_AGAIN: Final = "copy or export it again"
 
 
 def exists(path: InputPath) -> bool:
@@ -107,7 +107,7 @@ def _open_local(path: Path) -> tuple[BufferedReader, int]:
     if path.is_symlink() and not path.exists():
         got = f"a link to nothing ({os.readlink(path)})"  # noqa: PTH115 - the text of the link, whatever it is
         raise MissingFileError(str(path), None, "a file", got, _COPY_AGAIN)
-    return open_regular(path, "put the reconstruction's file in its place")
+    return open_regular(path, "name a file, or put one in its place")
 
 
 def open_regular(path: Path, advice: str = "put a regular file in its place") -> tuple[BufferedReader, int]:
@@ -184,9 +184,9 @@ def _check_content(path: InputPath, file: BufferedReader, size: int, *, may_be_e
     head = file.peek(len(LFS_PREFIX))[: len(LFS_PREFIX)]  # reading and going back would ask a store twice
     if head == LFS_PREFIX:
         advice = "fetch the data with `git lfs pull`"
-        raise LfsPointerError(str(path), None, "a reconstruction's data", "a Git LFS pointer", advice)
+        raise LfsPointerError(str(path), None, "data", "a Git LFS pointer", advice)
     if size == 0 and not may_be_empty:
-        raise TruncatedFileError(str(path), None, "a reconstruction's data", "an empty file", _COPY_AGAIN)
+        raise TruncatedFileError(str(path), None, "data", "an empty file", _COPY_AGAIN)
 
 
 def read_bytes(path: InputPath) -> bytes:

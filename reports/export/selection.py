@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +19,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
-from sfm_audit.loaders import ModelRef
+from sfm_audit.loaders import MissingFileError, ModelRef
 from sfm_audit.loaders.datasets.input_state import read_input_state
 from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.run_folder.reader import RunReader
@@ -161,9 +162,16 @@ def images_of_model(run: RunReader, images: Sequence[AuditedImage], model: Path)
     LoadError
         The model's files cannot be read.
     """
-    state = read_input_state(str(model))
-    key = ModelRef("", "", "", str(model.resolve()), str(model)).key
     inputs = list(run.models())
+    known = ", ".join(entry.model_path for entry in inputs[:3]) + (", ..." if len(inputs) > 3 else "")
+    try:
+        state = read_input_state(str(model))
+    except MissingFileError as error:
+        if not model.is_dir():
+            raise
+        problem = f"holds no audit of {model}, which is no model's own folder"
+        raise RunFolderError(run.folder, problem, f"name one of its models ({known})") from error
+    key = ModelRef("", "", "", os.path.realpath(model), str(model)).key
     found = [entry for entry in inputs if entry.key == key]
     if found and found[0].sha256 != state.digest:
         problem = f"holds an audit of {model} from before its files changed"
@@ -171,7 +179,6 @@ def images_of_model(run: RunReader, images: Sequence[AuditedImage], model: Path)
     found = found or [entry for entry in inputs if entry.sha256 == state.digest]
     if len(found) != 1:
         problem = f"holds {len(found) or 'no'} {'audits of copies' if found else 'audit'} of {model}"
-        known = ", ".join(entry.model_path for entry in inputs[:3]) + (", ..." if len(inputs) > 3 else "")
         raise RunFolderError(run.folder, problem, f"name one of its models ({known}), or audit this one first")
     return tuple(image for image in images if image.model_path == found[0].model_path)
 

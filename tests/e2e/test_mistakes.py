@@ -43,6 +43,23 @@ WRONG_PATH = [
     ("explain dtaa IMAGE -o STORY", 3, "dtaa: expected a folder, found nothing"),
     ("calibrate none.csv", 3, "none.csv: "),
     ("calibrate notes.txt", 3, "notes.txt: "),
+    ("run data\\a\\sparse\\0 -o NEW", 3, "data\\a\\sparse\\0: expected a folder, found nothing; check the path"),
+    ("run C:\\photos -o NEW", 3, "C:\\photos: expected a folder, found nothing"),
+    ("run circle -o NEW", 3, "circle: expected a folder, found a circle of links"),
+    (
+        "run RUN -o NEW",
+        3,
+        "RUN: is the folder of a run and holds no models; report, diagnose, filter and",
+    ),
+    ("run data -o NEW --database lost.db", 3, "--database lost.db: there is no such file; check the path"),
+    ("run data -o NEW --database photos", 3, "--database photos: is a folder; name the database.db in it, or auto"),
+    ("report RUN/run.json", 3, "RUN/run.json: holds no run"),
+    ("diagnose data", 3, "data: holds no run"),
+    ("filter RUN --model data --model-out OUT", 2, "name one of its models (data/a/sparse/0)"),
+    ("filter RUN --model dtaa --model-out OUT", 3, "dtaa: "),
+    ("calibrate empty.csv", 3, "empty.csv: expected data, found an empty file; copy or export it again"),
+    ("calibrate photos", 3, "photos: expected a file, found a folder; name a file"),
+    ("explain RUN id:1 -o STORY --images fotos", 2, "fotos: is no folder"),
 ]
 WRONG_WORD = [
     ("rnu data -o NEW", 2, "No such command 'rnu', did you mean run?"),
@@ -65,6 +82,25 @@ WRONG_WORD = [
     ("calibrate points.csv --models D9", 2, "expected some of D1, D3, pnprf, colmap, found D9"),
     ("simulate bord -o OUT", 2, "bord"),
     ("report RUN -o new.html --worst 1000", 2, "1000"),
+    ("report RUN -o new.html --reason misfit_radail", 2, "did you mean misfit_radial?"),
+    ("report RUN -o new.html --severity bad", 2, "'bad' is not one of"),
+    ("report RUN -o new.html --min-effect 0.1px", 2, "smaller misfits were not admitted to the joint test, run again"),
+    ("explain-code MISFIT_RADIAL", 2, "did you mean misfit_radial?"),
+    ("explain-code zebra", 2, "zebra: no such reason or finding; without a code, explain-code lists all"),
+    ("diagnose RUN nothere", 2, "RUN: holds no model 'nothere'; it holds a/0"),
+    ("diagnose RUN a --as opencv", 2, "--as opencv: no camera model, did you mean OPENCV?"),
+    ("diagnose RUN a --as SIMPLE_PINHOLE", 2, "cannot express the cameras"),
+    ("explain RUN IMAGE -o STORY", 2, "name it as RUN/images does, or id:<image_id>"),
+    (
+        "run data -o NEW --config effect.toml",
+        2,
+        "a number with its unit, such as 0.2px or 0.5sigma, found 0.2",
+    ),
+    ("run data -o NEW --config latin.toml", 2, "latin.toml: not a TOML file: byte 5 is not UTF-8; save it as UTF-8"),
+    ("check RUN --policy-file text.toml", 2, "limits.max_share_rejected: expected a valid number, found '10%'"),
+    ("check RUN --policy-file section.toml", 2, "unknown key limit, did you mean limits?"),
+    ("check RUN --policy limits.toml", 2, "'limits.toml' is not one of"),
+    ("filter RUN -o kept.txt", 2, "No such option '-o'"),
 ]
 MISSING_OR_CONTRADICTING = [
     ("run", 2, "Missing argument 'PATH...'"),
@@ -89,6 +125,11 @@ MISSING_OR_CONTRADICTING = [
     (f"filter RUN --model {MODEL} --model-out {MODEL}", 2, "is what is read; write somewhere else"),
     (f"explain {MODEL} -o STORY", 2, "Missing argument 'IMAGE'"),
     ("explain data IMAGE -o STORY", 2, "holds 2 models"),
+    ("explain RUN IMAGE -o STORY --noise track", 2, "--noise changes what is measured, and a run was measured already"),
+    (f"explain {MODEL} IMAGE -o STORY --severity hard", 2, "are about a RUN, not a model"),
+    ("diagnose RUN a --no-refit --as RADIAL", 2, "--no-refit contradicts --as and --out"),
+    ("diagnose RUN a --out OUT", 2, "--out takes one --as CAMERA_MODEL"),
+    ("diff RUN RUN RUN", 2, "Got unexpected extra argument (RUN)"),
 ]
 TAKEN = [
     ("run data -o README.md", 4, "README.md: cannot be written (it is a file, and a run is a folder)"),
@@ -104,6 +145,12 @@ TAKEN = [
     ("demo -o README.md", 4, "README.md: is a file"),
     ("check RUN --policy-file limits.toml --json no/such/file", 4, "no/such/file: cannot be written"),
     ("calibrate points.csv -o photos", 2, "photos: is not an earlier calibration"),
+    ("diagnose RUN a --as RADIAL --out photos", 2, "photos: exists; choose a new folder with --out"),
+    ("diagnose RUN a --as RADIAL --out README.md", 2, "README.md: exists; choose a new folder with --out"),
+    ("diagnose RUN a --no-refit --json photos", 2, "photos: is a folder; name a file for --json"),
+    ("filter RUN --list photos", 2, "photos: is a folder; name a file"),
+    ("diff RUN RUN --html photos", 2, "photos: is a folder; name a file"),
+    ("run data -o data/a", 2, "data/a: is not a run folder and not empty ('sparse' is in it)"),
 ]
 OLD_OR_DAMAGED = [
     ("run CUT -o NEW1 --quiet", 3, "CUT/images.bin: "),
@@ -116,10 +163,13 @@ OLD_OR_DAMAGED = [
     ("filter UNFINISHED --list kept.txt", 2, "UNFINISHED: "),
     ("check CHANGED --policy-file limits.toml", 3, "CHANGED: "),
     ("report FOREIGN", 3, "FOREIGN: "),
+    ("diagnose CHANGED a --no-refit", 3, "CHANGED: "),
+    ("explain CHANGED id:1 -o STORY", 3, "CHANGED: "),
+    ("run ZERO -o NEW3 --quiet", 3, "ZERO/images.bin: expected data, found an empty file; copy or export it again"),
 ]
 NOT_PERMITTED = [
     ("run data -o locked/RUN", 4, "locked/RUN: cannot be written"),
-    ("run sealed -o NEW3 --quiet", 3, "sealed"),
+    ("run sealed -o NEW4 --quiet", 3, "sealed"),
     ("report RUN -o locked/report.html", 4, "locked/report.html: cannot be written"),
     ("filter RUN --list locked/kept.txt", 4, "locked/kept.txt"),
     ("check RUN --policy-file secret.toml", 2, "secret.toml: cannot be read (Permission denied)"),
@@ -144,6 +194,10 @@ def place(tmp_path_factory):
     texts = {
         "notes.txt": "no table, no settings: only notes\n",
         "README.md": "# Photos\n",
+        "empty.csv": "",
+        "effect.toml": "min_effect = 0.2\n",
+        "text.toml": "limits.max_share_rejected = '10%'\n",
+        "section.toml": "[limit]\nmax_share_rejected = 0.1\n",
         "points.csv": "x,y,X,Y,Z\n1,2,3,4,5\n",
         "empty.toml": "",
         "typo.toml": "alhpa = 0.1\n",
@@ -154,15 +208,18 @@ def place(tmp_path_factory):
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
+    (folder / "latin.toml").write_bytes(b"# caf\xe9\n")
+    (folder / "circle").symlink_to("circle")
     _broken_models(folder)
     _broken_runs(folder)
     return folder
 
 
 def _broken_models(folder: Path) -> None:
-    for name in ("CUT", "POINTER", "sealed"):
+    for name in ("CUT", "POINTER", "ZERO", "sealed"):
         shutil.copytree(folder / MODEL, folder / name)
     truncate(folder / "CUT" / "images.bin")
+    (folder / "ZERO" / "images.bin").write_bytes(b"")
     pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 12345\n"
     (folder / "POINTER" / "images.bin").write_text(pointer, encoding="utf-8")
 
@@ -211,7 +268,7 @@ def check_one_line(args: str, code: int, words: str, capsys) -> None:
     before = sorted(Path().rglob("*"))
     assert main(args.split()) == code, capsys.readouterr().err
     out, err = capsys.readouterr()
-    assert out == "" or "--json" in args  # the page of a gate whose report cannot be written is printed all the same
+    assert out == "" or "--json" in args  # the page of a verb whose report cannot be written is printed all the same
     assert err.startswith("sfm-audit: ")
     assert err.count("\n") == 1
     assert words in err

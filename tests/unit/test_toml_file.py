@@ -107,3 +107,9 @@ def test_every_small_text_is_what_tomllib_says(tmp_path_factory, text):
             read_toml(file)
     else:
         assert read_toml(file) == expected
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path):
+    file = tmp_path / "notepad.toml"
+    file.write_bytes(b"\xef\xbb\xbfalpha = 0.1\n")
+    assert read_toml(file) == {"alpha": 0.1}
