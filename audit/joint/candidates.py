@@ -12,7 +12,7 @@ import numpy as np
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, design_scores
 from sfm_audit.audit.joint.system import Base, IncludedFields
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +121,7 @@ def _points_of(base: Base, images: Sequence[int]) -> IntArray:
     """The distinct points that the images see."""
     observations = base.observations
     if len(images) == 1:
-        return np.unique(observations.point_idx[observations.rows(images[0])])
+        return distinct(observations.point_idx[observations.rows(images[0])])
     seen = np.zeros(observations.num_points, dtype=bool)
     for image in images:
         seen[observations.point_idx[observations.rows(image)]] = True
@@ -207,8 +207,8 @@ class _Coupling:
     def __init__(self, base: Base, images: list[IntArray]) -> None:
         self._base = base
         layout = base.observations.layout
-        around = np.unique(np.concatenate(images))
-        columns = np.unique(layout.columns[around])
+        around = distinct(np.concatenate(images))
+        columns = distinct(layout.columns[around])
         columns = columns[columns < layout.num_columns]
         extra = [base.included[image].columns for image in around.tolist() if image in base.included]
         self.support = np.concatenate([columns, *sorted(extra, key=lambda own: int(own[0]))])
@@ -244,7 +244,7 @@ class _Coupling:
         shared = around.gather(design_crossed(design, weight), absorbed)
         shared = observations.transform[around.images].transpose(0, 2, 1) @ shared
         places = self._places(around.images)
-        if np.unique(places).size == places.size:
+        if distinct(places).size == places.size:
             right[places] -= shared
         else:
             np.subtract.at(right, places, shared)

@@ -10,7 +10,7 @@ from scipy import sparse
 from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
 from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE
 from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, distinct
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +81,7 @@ def _joint_gram(
         parts.append(sparse.coo_array((crossed.ravel(), (row.ravel(), column.ravel())), shape=shape).tocsc())
     out = -coupled.T @ solution
     crossed_all = sparse.hstack(parts).tocsr()
-    seen = np.unique(crossed_all.nonzero()[0] // 3)
+    seen = distinct(crossed_all.nonzero()[0] // 3)
     inverse = sparse.bsr_array(
         (base.point_inverse[seen], seen, np.searchsorted(seen, np.arange(observations.num_points + 1))),
         shape=(3 * observations.num_points,) * 2,

@@ -9,7 +9,7 @@ from scipy import sparse
 
 from sfm_audit.audit.joint.neighbourhood import neighbourhood, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ def _eliminate_points(
     layout, transform = observations.layout, observations.transform
     to_plain = observations.plain_weight / observations.weight
     for image in observations.used_images:
-        points = np.unique(observations.point_idx[observations.rows(image)])
+        points = distinct(observations.point_idx[observations.rows(image)])
         around = neighbourhood(observations, points).from_image(image)
         track = around.track[: around.starts[1]]  # its own views come first
         crossed = design_crossed(*observations.weighted(around.views))
@@ -84,7 +84,7 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
     layout, transform = observations.layout, observations.transform
     blocks = _Blocks(layout.num_columns)
     for image in observations.used_images:
-        points = np.unique(observations.point_idx[observations.rows(image)])
+        points = distinct(observations.point_idx[observations.rows(image)])
         around = neighbourhood(observations, points).from_image(image)
         track = around.track[: around.starts[1]]
         score = observations.scores(around.views, left_px)

@@ -129,7 +129,7 @@ def _close_pairs(seen: ShouldSee) -> _ClosePairs:
     half = (sees.T @ should).toarray()
     either = half + half.T - both
     num = np.maximum((should.T @ should).toarray(), 1.0)
-    rays = [seen.matrix(seen.ray[:, k]) for k in range(3)]
+    rays = [seen.matrix(seen.ray[k]) for k in range(3)]
     cosine = np.sum([(ray.T @ ray).toarray() for ray in rays], axis=0) / num
     logs = (seen.matrix(np.log(seen.distance)).T @ should).toarray()
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 MAX_ANGLE_DEG: Final = 12.0
@@ -21,6 +21,7 @@ MAX_DISTANCE_RATIO: Final = 1.4
 MIN_TRACK: Final = 3
 MAX_POINTS: Final = 20_000
 """Points that are asked; of more, a random part with a fixed seed."""
+_MIN_COSINE: Final = float(np.cos(np.radians(MAX_ANGLE_DEG)))
 _MARGIN: Final = 0.49  # of the image's size, from its middle, without distortion
 
 
@@ -29,7 +30,7 @@ class ShouldSee:
     """Pairs of a point and an image that should see it.
 
     num_points, num_images: sizes.    point, image: (m,) the pairs.    sees: (m,) whether it does.
-    ray: (m, 3) unit vector from the point to the image.    distance: (m,) model units.
+    ray: (3, m) unit vector from the point to the image.    distance: (m,) model units.
     """
 
     num_points: int
@@ -52,19 +53,19 @@ def should_see(model: SparseModel, residuals: ModelResiduals, *, seed: int = 0) 
     rotation, centre, usable = _poses(model)
     parts = [_of_image(seen, model, j, rotation[j], centre) for j in np.flatnonzero(usable).tolist()]
     point, image, sees, ray, distance = (
-        np.concatenate([empty, *(part[k] for part in parts)]) for k, empty in enumerate(_EMPTY)
+        np.concatenate([empty, *(part[k] for part in parts)], axis=-1) for k, empty in enumerate(_EMPTY)
     )
-    return ShouldSee(len(seen.xyz), len(model.images), point, image, sees, ray, distance)
+    return ShouldSee(seen.xyz.shape[1], len(model.images), point, image, sees, ray, distance)
 
 
-_EMPTY: Final = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.bool_), np.empty((0, 3)), np.empty(0))
+_EMPTY: Final = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.bool_), np.empty((3, 0)), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
     """The points asked, and who sees them.
 
-    xyz: (p, 3).    offsets: (p + 1,) observations by point; image, ray, distance: of each.
+    xyz: (3, p).    offsets: (p + 1,) observations by point; image (n,), ray (3, n), distance (n,): of each.
     """
 
     xyz: FloatArray
@@ -79,7 +80,7 @@ class _Seen:
         num_images = len(model.images)
         image = np.repeat(np.arange(num_images), np.diff(residuals.offsets))
         _, centre, usable = _poses(model)
-        keys = np.unique(residuals.point_idx * num_images + image)
+        keys = distinct(residuals.point_idx * num_images + image)
         keys = keys[usable[keys % num_images]] if num_images else keys
         length = np.bincount(keys // max(num_images, 1), minlength=len(model.points))
         chosen = np.flatnonzero((length >= MIN_TRACK) & np.isfinite(model.points.xyz_world).all(axis=1))
@@ -89,8 +90,8 @@ class _Seen:
         row[chosen] = np.arange(len(chosen))
         keys = keys[row[keys // max(num_images, 1)] >= 0]
         point, image = row[keys // max(num_images, 1)], keys % max(num_images, 1)
-        xyz = model.points.xyz_world[chosen]
-        ray, distance = _rays(centre[image] - xyz[point])
+        xyz = np.ascontiguousarray(model.points.xyz_world[chosen].T)
+        ray, distance = _rays(centre[image].T - xyz[:, point])
         return cls(xyz, np.searchsorted(point, np.arange(len(chosen) + 1)), image, ray, distance)
 
 
@@ -104,8 +105,10 @@ def _poses(model: SparseModel) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 def _rays(from_point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    distance = np.linalg.norm(from_point, axis=1)
-    return from_point / np.maximum(distance, np.finfo(float).tiny)[:, None], distance
+    """Return directions (3, n) and lengths (n,) of (3, n)."""
+    x, y, z = from_point
+    distance = np.sqrt(x * x + y * y + z * z)
+    return from_point / np.maximum(distance, np.finfo(float).tiny), distance
 
 
 def _of_image(
@@ -114,22 +117,24 @@ def _of_image(
     """Return the points that one image should see: the columns of `ShouldSee`."""
     camera = model.camera(int(model.images.camera_idx[image_idx]))
     focal = float(np.mean([camera.params[k] for k in camera.model.focal_idxs]))
-    from_image = seen.xyz - centre[image_idx]
-    depth = from_image @ rotation[2]
-    limit = depth * _MARGIN / focal
-    inside = (np.abs(from_image @ rotation[0]) < limit * camera.width) & (depth > 0)
-    inside &= np.abs(from_image @ rotation[1]) < limit * camera.height
-    point = np.flatnonzero(inside)
-    ray, distance = _rays(-from_image[point])
+    from_image = seen.xyz - centre[image_idx][:, None]
+    x, y, depth = rotation @ from_image
+    limit = depth * (_MARGIN / focal)
+    point = np.flatnonzero((np.abs(x) < limit * camera.width) & (np.abs(y) < limit * camera.height) & (depth > 0))
+    ray, distance = _rays(-from_image.take(point, axis=1))
     count = seen.offsets[point + 1] - seen.offsets[point]
     which = np.repeat(np.arange(len(point)), count)
     starts = np.cumsum(count) - count
     row = np.arange(len(which)) - np.repeat(starts - seen.offsets[point], count)
-    ratio = distance[which] / np.maximum(seen.distance[row], np.finfo(float).tiny)
-    near = (seen.ray[row] * ray[which]).sum(axis=1) > np.cos(np.radians(MAX_ANGLE_DEG))
-    near &= (ratio < MAX_DISTANCE_RATIO) & (ratio * MAX_DISTANCE_RATIO > 1)
+    own, cosine = distance.take(which), np.zeros(len(which))
+    for axis in range(3):
+        cosine += seen.ray[axis].take(row) * ray[axis].take(which)
+    there = seen.distance.take(row)
+    near = (cosine > _MIN_COSINE) & (own < MAX_DISTANCE_RATIO * there) & (own * MAX_DISTANCE_RATIO > there)
     sees = np.zeros(len(point), dtype=np.bool_)
-    sees[which[seen.image[row] == image_idx]] = True
-    should = sees | (np.bincount(which[near], minlength=len(point)) > 0)
-    image = np.full(int(np.count_nonzero(should)), image_idx)
-    return point[should], image, sees[should], ray[should], distance[should]
+    sees[which[seen.image.take(row) == image_idx]] = True
+    should = sees.copy()
+    should[which[near]] = True
+    kept = np.flatnonzero(should)
+    image = np.full(len(kept), image_idx)
+    return point[kept], image, sees[kept], ray.take(kept, axis=1), distance[kept]

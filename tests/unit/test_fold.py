@@ -122,7 +122,7 @@ def test_who_should_see_a_point_stands_close_to_one_that_does():
     assert len(pairs) == views[views > 2].sum()
     others = ~seen.sees
     assert 0 < others.sum() < 0.5 * len(pairs)  # one image further at either end
-    np.testing.assert_allclose(np.linalg.norm(seen.ray, axis=1), 1.0)
+    np.testing.assert_allclose(np.linalg.norm(seen.ray, axis=0), 1.0)
 
 
 def test_small_models_are_not_asked():
