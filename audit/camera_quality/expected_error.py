@@ -6,19 +6,21 @@ Conditional on the points, like the covariance it is made of: a lower bound in a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.identifiability import ParameterCovariance, fitted_names
+from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, ParameterCovariance, fitted_names
 from sfm_audit.audit.cameras import unproject
+from sfm_audit.audit.cameras.columns import EPSILON
 from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import CameraRecord
 
 GRID: Final = 16
+_TRANSLATION: Final = frozenset(POSE_NAMES[3:])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +56,24 @@ def grid_rays(camera: CameraRecord, grid: int = GRID) -> FloatArray:
     return unproject(camera.model, camera.params, pixels)
 
 
+def grid_columns(camera: CameraRecord, grid: int = GRID, *, rays: FloatArray | None = None) -> FloatArray:
+    """Return (q, 2, grid * grid) J_theta of `fitted_names` at depth 1 (distance 1 of spherical cameras), px per unit.
+
+    At depth d the columns of the translation are these over d, all others are these: they depend on the camera alone.
+
+    Parameters
+    ----------
+    rays : `grid_rays` of this camera and grid, where they are at hand
+    """
+    rays = grid_rays(camera, grid) if rays is None else rays
+    with np.errstate(invalid="ignore", over="ignore"):
+        return nuisance_columns(camera.model, project_image(camera, _at_depth(camera, rays, 1.0)))
+
+
+def _at_depth(camera: CameraRecord, rays: FloatArray, depth: float) -> FloatArray:
+    return rays * depth if camera.model.is_spherical else rays * (depth / rays[:, 2:])
+
+
 def median_depth(camera: CameraRecord, xyz_cam: FloatArray) -> float:
     """Median Zc of (n, 3) points in the camera frame, model units; spherical cameras: median distance; NaN if none."""
     if not len(xyz_cam):
@@ -69,7 +89,7 @@ def expected_error_map(
     depth: float,
     *,
     grid: int = GRID,
-    rays: FloatArray | None = None,
+    columns: FloatArray | None = None,
 ) -> ExpectedErrorMap:
     """Return the expected error of one measurement at every cell centre of the image.
 
@@ -80,7 +100,7 @@ def expected_error_map(
     sigma_px : noise of a measurement per axis, px; sigma_constant_px, the sigma behind the covariance
     depth : model units, see `median_depth`
     grid : cells per side
-    rays : `grid_rays` of this camera and grid, where they are at hand
+    columns : `grid_columns` of this camera and grid, where they are at hand
 
     Raises
     ------
@@ -94,15 +114,32 @@ def expected_error_map(
     sigma_d is taken as sigma_constant_px: under the noise model ``track`` the sigma_d_px of (1) is what is left when
     the tracks have explained their share, often 0, and no measurement error.
 
-    A singular or unknown covariance gives NaN everywhere.
+    A singular or unknown covariance gives NaN everywhere, and so does a depth at which nothing projects.
     """
-    rays = grid_rays(camera, grid) if rays is None else rays
+    columns = grid_columns(camera, grid) if columns is None else columns
     pixels = cell_centres_px(camera.width, camera.height, grid)
-    with np.errstate(invalid="ignore", over="ignore"):
-        xyz_cam = rays * depth if camera.model.is_spherical else rays * (depth / rays[:, 2:])
-        jacobian = nuisance_columns(camera.model, project_image(camera, xyz_cam))
-        error = measurement_error_px(jacobian, fitted_names(camera.model), parameters, sigma_px)
+    names = fitted_names(camera.model)
+    error = measurement_error_px(columns, names, _seen_from_one(camera, parameters, depth), sigma_px)
     return ExpectedErrorMap(pixels, error.reshape(grid, grid))
+
+
+def expected_error_px(
+    camera: CameraRecord, parameters: ParameterCovariance, sigma_px: float, depth: float, columns: FloatArray
+) -> float:
+    """Return the median of the map alone; arguments as of `expected_error_map`."""
+    seen = _seen_from_one(camera, parameters, depth)
+    error = measurement_error_px(columns, fitted_names(camera.model), seen, sigma_px)
+    error.sort()  # NaN last
+    num = int(np.searchsorted(error, np.inf))
+    return 0.5 * float(error[(num - 1) // 2] + error[num // 2]) if num else math.nan
+
+
+def _seen_from_one(camera: CameraRecord, parameters: ParameterCovariance, depth: float) -> ParameterCovariance:
+    """Return the covariance in the unit of length that makes ``depth`` 1; NaN where nothing projects from there."""
+    nearest = 0.0 if camera.model.is_spherical else EPSILON
+    inverse = 1.0 / depth if nearest <= depth < math.inf and depth else math.nan
+    unit = np.array([inverse if name in _TRANSLATION else 1.0 for name in parameters.names])
+    return replace(parameters, covariance=parameters.covariance * unit * unit[:, None])
 
 
 def measurement_error_px(

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.expected_error import expected_error_map
 from sfm_audit.audit.camera_quality.identifiability import ParameterCovariance, fitted_names
 from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.consistency import ImageConsistency
@@ -96,7 +95,7 @@ def expected_error_px(quality: CameraQuality, covariance: FloatArray, sigma_px: 
     if not math.isfinite(sigma_px) or not covariance.size or not math.isfinite(covariance.sum()):
         return math.nan
     parameters = ParameterCovariance(fitted_names(camera.model), covariance, 1.0)
-    return expected_error_map(camera, parameters, sigma_px, quality.median_depth, rays=quality.shape.rays).median_px
+    return quality.shape.expected_error_px(parameters, sigma_px, quality.median_depth)
 
 
 def pose_columns(joint: JointAudit, image_idx: int, names: Sequence[str]) -> dict[str, object]:

@@ -6,7 +6,8 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,10 @@ from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import Finding, SparseModel
 
 Row = dict[str, object]
+_NO_OWN_STEPS: Final[Row] = {
+    "own_step_px": math.nan,
+    **{f"own_{name}_{what}": math.nan for name in own_parameter_names() for what in ("step", "sd")},
+}
 
 
 def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
@@ -39,7 +44,7 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
     quality = audit.quality
     lost = inliers.num_behind + inliers.num_nonfinite + inliers.num_dangling
     return {
-        **asdict(labels),
+        **_label_columns(labels),
         "image_id": image.image_id,
         "image_name": image.name,
         "camera_id": image.camera_id,
@@ -47,8 +52,8 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         "width": camera.width if camera else None,
         "height": camera.height if camera else None,
         "params": camera.params if camera else None,
-        **dict(zip(("qw", "qx", "qy", "qz"), map(float, image.quat_cam_from_world_wxyz), strict=True)),
-        **dict(zip(("tx", "ty", "tz"), map(float, image.translation_cam_from_world), strict=True)),
+        **dict(zip(("qw", "qx", "qy", "qz"), image.quat_cam_from_world_wxyz.tolist(), strict=True)),
+        **dict(zip(("tx", "ty", "tz"), image.translation_cam_from_world.tolist(), strict=True)),
         "median_depth": quality.median_depth if quality else math.nan,
         "num_points2d": image.num_points2d,
         "num_linked": num_inliers + lost,
@@ -79,6 +84,12 @@ def image_row(audit: ImageAudit, labels: ModelLabels, noise_name: str) -> Row:
         **verdict_columns(audit.decision),
         **{name: value for name, value in audit.outside.items() if name not in OUTSIDE_COLUMNS},
     }
+
+
+@lru_cache(maxsize=16)
+def _label_columns(labels: ModelLabels) -> Row:
+    """Text columns that name the model."""
+    return asdict(labels)
 
 
 def _outside_columns(audit: ImageAudit) -> Row:
@@ -256,12 +267,11 @@ def _sd_of_first_focal(own: OwnDiagnostics | None, model: CameraModel) -> float:
 
 def own_columns(own: OwnDiagnostics | None) -> Row:
     """Return the joint step of every parameter that some camera model has."""
-    steps = {step.name: step for step in own.steps} if own else {}
-    row: Row = {"own_step_px": own.step_px if own else math.nan}
-    for name in own_parameter_names():
-        step = steps.get(name)
-        row[f"own_{name}_step"] = step.step if step else math.nan
-        row[f"own_{name}_sd"] = step.sd if step else math.nan
+    row = dict(_NO_OWN_STEPS)
+    if own:
+        row["own_step_px"] = own.step_px
+        for step in own.steps:
+            row[f"own_{step.name}_step"], row[f"own_{step.name}_sd"] = step.step, step.sd
     return row
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ class Coded:
         return len(self.codes)
 
 
+_FLOATS: Final = frozenset({float, np.float64, type(None)})
 Values = npt.NDArray[Any] | Sequence[Any]
 
 
@@ -100,6 +101,8 @@ def _split_missing(values: Values, dtype: np.dtype[Any]) -> tuple[npt.NDArray[An
         return values.filled(0), ~np.ma.getmaskarray(values)
     if isinstance(values, np.ndarray) and values.dtype != object:
         return values, np.ones(len(values), dtype=bool)
+    if dtype.kind == "f" and _FLOATS.issuperset(map(type, values)):
+        return np.array(values, dtype=np.float64), np.ones(len(values), dtype=bool)  # None becomes NaN, which is null
     valid = np.array([value is not None for value in values], dtype=bool)
     blank = dtype.type(0).item()
     plain = np.array([blank if value is None else value for value in values])

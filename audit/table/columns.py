@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cache
 from typing import Final, Literal
 
 import pyarrow as pa
@@ -103,6 +104,7 @@ def _own_steps() -> tuple[Column, ...]:
     return (*out, *(number(name, f"{words}, had it alone been freed") for name, words in IMPLIED.items()))
 
 
+@cache
 def own_parameter_names() -> tuple[str, ...]:
     """Return the names of all parameters that COLMAP refines by default, in the order of its models."""
     fixed = {"cx", "cy", "w", "h"}

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from sfm_audit.audit.camera_quality.expected_error import cell_centres_px, expected_error_map, grid_rays, median_depth
+from sfm_audit.audit.camera_quality.expected_error import (
+    cell_centres_px,
+    expected_error_map,
+    expected_error_px,
+    grid_columns,
+    grid_rays,
+    measurement_error_px,
+    median_depth,
+)
 from sfm_audit.audit.camera_quality.identifiability import fitted_names, parameter_covariance
 from sfm_audit.audit.cameras import project
 from sfm_audit.audit.inliers.projected import project_image
@@ -112,8 +120,23 @@ def test_works_for_other_families(name, params):
     _, parameters = covariance_of(camera, xyz_cam, 0.5)
     found = expected_error_map(camera, parameters, 0.5, median_depth(camera, xyz_cam))
     assert found.median_px > 0.5 * np.sqrt(2.0)
-    again = expected_error_map(camera, parameters, 0.5, median_depth(camera, xyz_cam), rays=grid_rays(camera))
+    depth = median_depth(camera, xyz_cam)
+    columns = grid_columns(camera, rays=grid_rays(camera))
+    again = expected_error_map(camera, parameters, 0.5, depth, columns=columns)
     assert_allclose(again.error_px, found.error_px, rtol=1e-12)
+    there = grid_rays(camera) * depth / (1.0 if camera.model.is_spherical else grid_rays(camera)[:, 2:])
+    jacobian = nuisance_columns(camera.model, project_image(camera, there))
+    error = measurement_error_px(jacobian, fitted_names(camera.model), parameters, 0.5)
+    assert_allclose(found.error_px.ravel(), error, rtol=1e-9)
+    assert_allclose(expected_error_px(camera, parameters, 0.5, depth, columns), found.median_px, rtol=1e-12)
+
+
+@pytest.mark.parametrize("depth", [0.0, -1.0, 1e-300, np.nan, np.inf])
+def test_where_nothing_projects_no_error_is_known(depth):
+    camera = camera_of()
+    _, parameters = covariance_of(camera, points(np.random.default_rng(0)), 0.5)
+    assert np.isnan(expected_error_map(camera, parameters, 0.5, depth).error_px).all()
+    assert np.isnan(expected_error_px(camera, parameters, 0.5, depth, grid_columns(camera)))
 
 
 def test_parameters_without_effect_are_left_out():
