@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
@@ -29,11 +30,14 @@ from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
 from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
-from sfm_audit.audit.normality import NormalityTests, normality_tests
+from sfm_audit.audit.normality import NormalityTests, normality_tests, normality_tests_of
 from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import ImageRecord, InlierSet
+
+_MAX_VALUES_AT_ONCE: Final = 1 << 16
+_MAX_IMAGES_AT_ONCE: Final = 512
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,11 +189,39 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
     return audit_image(evidence, config)
 
 
+def audit_images(images: Iterable[ImageEvidence], config: AuditConfig) -> Iterator[ImageAudit]:
+    """Audit images one after the other; those with few observations are tested together, some at once."""
+    waiting: list[ImageEvidence] = []
+    num_values = 0
+    for evidence in images:
+        waiting.append(evidence)
+        num_values += evidence.constant.z.size
+        if num_values > _MAX_VALUES_AT_ONCE or len(waiting) == _MAX_IMAGES_AT_ONCE:
+            yield from _audited_together(waiting, config)
+            waiting, num_values = [], 0
+    yield from _audited_together(waiting, config)
+
+
+def _audited_together(images: Sequence[ImageEvidence], config: AuditConfig) -> Iterator[ImageAudit]:
+    of_chosen = normality_tests_of([evidence.chosen.z for evidence in images])
+    of_constant = of_chosen
+    if any(evidence.chosen is not evidence.constant for evidence in images):
+        of_constant = normality_tests_of([evidence.constant.z for evidence in images])
+    for evidence, tests, constant_tests in zip(images, of_chosen, of_constant, strict=True):
+        yield _audited(evidence, tests, constant_tests, config)
+
+
 def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
     """Test the standardised residuals of the chosen and of the constant noise model, and decide."""
+    tests = normality_tests(evidence.chosen.z)
+    is_one = evidence.chosen is evidence.constant
+    return _audited(evidence, tests, tests if is_one else normality_tests(evidence.constant.z), config)
+
+
+def _audited(
+    evidence: ImageEvidence, tests: NormalityTests, constant_tests: NormalityTests, config: AuditConfig
+) -> ImageAudit:
     chosen, constant, quality = evidence.chosen, evidence.constant, evidence.quality
-    tests = normality_tests(chosen.z)
-    constant_tests = tests if chosen is constant else normality_tests(constant.z)
     diagnostics = _diagnostics(evidence, tests)
     decision = decide(diagnostics, config)
     advice = None

@@ -18,7 +18,7 @@ from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
 from sfm_audit.audit.decision.triage import triage
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
 from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, pose_findings, residual_findings
-from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, camera_diagnostics
+from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, audit_images, camera_diagnostics
 from sfm_audit.audit.engine.jointly import (
     consistency_diagnostics,
     expected_error_px,
@@ -35,7 +35,7 @@ from sfm_audit.audit.engine.quality import quality_of_images
 from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
 from sfm_audit.audit.engine.tables import ModelAudit, images_table, table_of
 from sfm_audit.audit.inliers.frames import claimed_frames
-from sfm_audit.audit.inliers.projected import image_inliers
+from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
@@ -236,26 +236,19 @@ class ModelAuditor:
     def inliers(self, image: int | str) -> InlierSet:
         """Return the 2D-3D inliers of an image, given its row, its name or ``id:<image_id>``."""
         image_idx = self.model.image_idx(image) if isinstance(image, str) else image
-        residuals, observations = self.residuals, self.model.observations
-        row = residuals.observation_row[residuals.rows(image_idx)]
-        point_idx = observations.point_idx[row]
-        return InlierSet(
-            self.model.image(image_idx),
-            observations.xy_px.take(row, axis=0),
-            self.model.points.xyz_world.take(point_idx, axis=0),
-            point_idx,
-            num_dangling=int(residuals.num_dangling[image_idx]),
-            num_behind=int(residuals.num_behind[image_idx]),
-            num_nonfinite=int(residuals.num_nonfinite[image_idx]),
-        )
+        return inlier_set(self.model, self.residuals, image_idx)
 
     def image(self, image: int | str) -> ImageAudit:
         """Audit one image within its model, given its row, its name or ``id:<image_id>``."""
         image_idx = self.model.image_idx(image) if isinstance(image, str) else image
+        return audit_image(self.evidence(image_idx), self.config)
+
+    def evidence(self, image_idx: int) -> ImageEvidence:
+        """Return what is known of the image in row ``image_idx`` before anything is decided."""
         rows = self.residuals.rows(image_idx)
         residuals_px = self.residuals.residuals_px[:, rows]
         constant = constant_noise(residuals_px)
-        evidence = ImageEvidence(
+        return ImageEvidence(
             self.inliers(image_idx),
             residuals_px,
             float(self.residuals.pose_offset_px[image_idx]),
@@ -273,7 +266,6 @@ class ModelAuditor:
             outside=self.outside.columns(image_idx),
             **self._of_camera(image_idx),
         )
-        return audit_image(evidence, self.config)
 
     def _of_camera(self, image_idx: int) -> dict[str, Any]:
         """What the joint system says of the image's camera, as `ImageEvidence` has it."""
@@ -396,5 +388,5 @@ def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality 
 
 def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:
     """Rows of the image table and decisions about some images."""
-    audits = map(auditor.image, image_idxs)
+    audits = audit_images(map(auditor.evidence, image_idxs), auditor.config)
     return [(image_row(audit, labels, auditor.config.noise), audit.decision) for audit in audits]

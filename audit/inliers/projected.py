@@ -15,7 +15,7 @@ from sfm_audit.audit.cameras import normalised, project_columns
 from sfm_audit.audit.inliers.residuals import ImageResiduals, ModelResiduals
 from sfm_audit.audit.inliers.stationarity import pose_columns
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet, SparseModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +98,22 @@ def image_inliers(
         np.asfortranarray(image.cam_from_world(xyz_world)),
         cam_from_gradient @ residuals.point_jacobian[:, :, columns],
         d_extra if chosen is None else d_extra.take(chosen, axis=2),
+    )
+
+
+def inlier_set(model: SparseModel, residuals: ModelResiduals, image_idx: int) -> InlierSet:
+    """Return the inliers of the image in row ``image_idx`` as its users see them."""
+    observations = model.observations
+    row = residuals.observation_row[residuals.rows(image_idx)]
+    point_idx = observations.point_idx[row]
+    return InlierSet(
+        model.image(image_idx),
+        observations.xy_px.take(row, axis=0),
+        model.points.xyz_world.take(point_idx, axis=0),
+        point_idx,
+        num_dangling=int(residuals.num_dangling[image_idx]),
+        num_behind=int(residuals.num_behind[image_idx]),
+        num_nonfinite=int(residuals.num_nonfinite[image_idx]),
     )
 
 

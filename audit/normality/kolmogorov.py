@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from scipy import special
 
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, distinct
+
+_Numbers = TypeVar("_Numbers", float, FloatArray)
 
 # Where the two-sided p is below this, it is taken from the exact one-sided sum, which keeps its relative accuracy.
 TAIL_P = 0.05
@@ -83,7 +86,38 @@ def kolmogorov_p(distance: float, num_values: int) -> float:
             return p
     if num_values < MIN_SERIES_VALUES:
         return min(1.0, 1.0 - _durbin_cdf(distance, num_values))
-    return min(1.0, 1.0 - _pelz_good_cdf(scaled, num_values))
+    return min(1.0, float(1.0 - _pelz_good_cdf(scaled, num_values)))
+
+
+def kolmogorov_p_of_stack(distances: FloatArray, num_values: int) -> FloatArray:
+    """Return `kolmogorov_p` of the distances (B,), finite, of samples of one size."""
+    p = np.where(distances >= 1.0, 0.0, 1.0)
+    open_ = np.flatnonzero((distances < 1.0) & (2.0 * num_values * distances > 1.0))
+    scaled = distances[open_] * math.sqrt(num_values)
+    tail = open_[2.0 * np.exp(-2.0 * scaled * scaled) < 2.0 * TAIL_P]
+    one_sided = _one_sided_of_stack(distances[tail], num_values)
+    p[tail] = 2.0 * (one_sided - one_sided**4 + one_sided**9)
+    body = np.setdiff1d(open_, tail[p[tail] < TAIL_P], assume_unique=True)
+    if num_values < MIN_SERIES_VALUES:
+        p[body] = np.minimum(1.0, 1.0 - _durbin_of_stack(distances[body], num_values))
+    else:
+        scaled = distances[body] * math.sqrt(num_values)
+        p[body] = np.minimum(1.0, 1.0 - _pelz_good_cdf(scaled, num_values))
+    return p
+
+
+def _one_sided_of_stack(distances: FloatArray, num_values: int) -> FloatArray:
+    """`one_sided_p` of (B,)."""
+    count, log_binomial = _log_binomials(num_values)
+    fraction = count / num_values
+    rest = 1.0 - distances[:, None] - fraction
+    inside = (rest > 0.0) & (count <= np.floor(num_values * (1.0 - distances))[:, None])
+    log_terms = (
+        log_binomial
+        + (count - 1.0) * np.log(distances[:, None] + fraction)
+        + (num_values - count) * np.log(np.where(inside, rest, 1.0))
+    )
+    return np.asarray(distances * _stride(num_values) * np.where(inside, np.exp(log_terms), 0.0).sum(axis=1))
 
 
 def one_sided_p(distance: float, num_values: int) -> float:
@@ -132,6 +166,26 @@ def _durbin_cdf(distance: float, num_values: int) -> float:
     return float(power[k - 1, k - 1] * special.gamma(num_values + 1.0))
 
 
+def _durbin_of_stack(distances: FloatArray, num_values: int) -> FloatArray:
+    """`_durbin_cdf` of (B,): those whose matrices have one size together."""
+    out = np.empty_like(distances)
+    k_of = np.floor(num_values * distances).astype(np.int64) + 1
+    for k in distinct(k_of).tolist():
+        chosen = np.flatnonzero(k_of == k)
+        size = 2 * k - 1
+        h = k - num_values * distances[chosen]
+        below, factorials = _durbin_shape(size)
+        matrix = np.tile(below, (len(chosen), 1, 1))
+        powers = h[:, None] ** np.arange(1.0, size + 1.0)
+        matrix[:, :, 0] -= powers
+        matrix[:, -1, :] -= powers[:, ::-1]
+        matrix[:, -1, 0] += np.maximum(0.0, 2.0 * h - 1.0) ** size
+        matrix /= factorials
+        power = np.linalg.matrix_power(matrix / num_values, num_values)
+        out[chosen] = power[:, k - 1, k - 1] * special.gamma(num_values + 1.0)
+    return out
+
+
 @lru_cache(maxsize=16)
 def _durbin_shape(size: int) -> tuple[FloatArray, FloatArray]:
     """(size, size): where Durbin's matrix is not zero, and the factorials that its entries are divided by."""
@@ -139,11 +193,11 @@ def _durbin_shape(size: int) -> tuple[FloatArray, FloatArray]:
     return np.where(row - col + 1 >= 0, 1.0, 0.0), special.gamma(np.maximum(row - col + 1, 0) + 1.0)
 
 
-def _pelz_good_cdf(x: float, num_values: int) -> float:
+def _pelz_good_cdf(x: _Numbers, num_values: int) -> _Numbers:
     r"""P(sqrt(N) D_N < x) = K0 + K1 / sqrt(N) + K2 / N + K3 / N^(3/2), Pelz & Good's equations."""
     x2 = x * x
-    s0, s1, s2, s3 = map(float, _ODD_POWERS @ np.exp(_ODD / (-2.0 * x2)))
-    t1, t2 = map(float, _WHOLE_POWERS @ np.exp(_WHOLE / (-2.0 * x2)))
+    s0, s1, s2, s3 = _ODD_POWERS @ np.exp(np.divide.outer(_ODD, -2.0 * x2))
+    t1, t2 = _WHOLE_POWERS @ np.exp(np.divide.outer(_WHOLE, -2.0 * x2))
     k0 = s0 / x
     k1 = (s1 - x2 * s0) / (6.0 * x**4)
     k2 = ((6.0 * x2 + 2.0) * x2**2 * s0 + (2.0 * x2 - 5.0) * x2 * s1 + (1.0 - 2.0 * x2) * s2) / (72.0 * x**7) - (
@@ -156,4 +210,5 @@ def _pelz_good_cdf(x: float, num_values: int) -> float:
         + (5.0 - 30.0 * x2) * s3
     ) / (6480.0 * x**10) + (3.0 * x2 * t1 - t2) / (216.0 * x**6)
     root = math.sqrt(num_values)
-    return math.sqrt(2.0 * math.pi) * (k0 + (k1 + (k2 + k3 / root) / root) / root)
+    cdf: _Numbers = math.sqrt(2.0 * math.pi) * (k0 + (k1 + (k2 + k3 / root) / root) / root)
+    return cdf

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
+
+import numpy as np
 
 from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
 from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
 from sfm_audit.loaders.arrays import FloatArray
 
 MIN_VALUES_DAGOSTINO = 8
+_Numbers = TypeVar("_Numbers", float, FloatArray)
 
 
 class Shape(NamedTuple):
@@ -76,20 +79,26 @@ def dagostino_pearson_from_shape(shape: Shape, num_values: int) -> Outcome:
     if num_values < MIN_VALUES_DAGOSTINO or math.isnan(shape.skewness):
         return NOT_RUN
     k2 = _skewness_z(shape.skewness, num_values) ** 2 + _kurtosis_z(shape.kurtosis_excess, num_values) ** 2
-    return Outcome(k2, math.exp(-0.5 * k2))
+    return Outcome(float(k2), math.exp(-0.5 * k2))
 
 
-def _skewness_z(skewness: float, n: int) -> float:
+def dagostino_pearson_of_stack(skewness: FloatArray, kurtosis_excess: FloatArray, num_values: int) -> FloatArray:
+    """Return K^2 (B,) of the shapes (B,) each of samples of one size, at least 8."""
+    return np.asarray(_skewness_z(skewness, num_values) ** 2 + _kurtosis_z(kurtosis_excess, num_values) ** 2)
+
+
+def _skewness_z(skewness: _Numbers, n: int) -> _Numbers:
     """D'Agostino (1970): standard normal under the null hypothesis, n >= 8."""
     y = skewness * math.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
     beta2 = 3.0 * (n * n + 27.0 * n - 70.0) * (n + 1) * (n + 3) / ((n - 2.0) * (n + 5) * (n + 7) * (n + 9))
     w2 = -1.0 + math.sqrt(2.0 * (beta2 - 1.0))
     delta = 1.0 / math.sqrt(0.5 * math.log(w2))
     alpha = math.sqrt(2.0 / (w2 - 1.0))
-    return delta * math.asinh(y / alpha)
+    z: _Numbers = delta * np.arcsinh(y / alpha)
+    return z
 
 
-def _kurtosis_z(kurtosis_excess: float, n: int) -> float:
+def _kurtosis_z(kurtosis_excess: _Numbers, n: int) -> _Numbers:
     """Anscombe & Glynn (1983): standard normal under the null hypothesis."""
     mean = 3.0 * (n - 1) / (n + 1)
     variance = 24.0 * n * (n - 2) * (n - 3) / ((n + 1) * (n + 1.0) * (n + 3) * (n + 5))
@@ -102,7 +111,7 @@ def _kurtosis_z(kurtosis_excess: float, n: int) -> float:
     )
     a = 6.0 + 8.0 / root_beta1 * (2.0 / root_beta1 + math.sqrt(1.0 + 4.0 / root_beta1**2))
     denominator = 1.0 + x * math.sqrt(2.0 / (a - 4.0))
-    if denominator == 0.0:
-        return math.nan
-    term = math.copysign(math.cbrt((1.0 - 2.0 / a) / abs(denominator)), denominator)
-    return (1.0 - 2.0 / (9.0 * a) - term) / math.sqrt(2.0 / (9.0 * a))
+    with np.errstate(divide="ignore"):
+        term = np.copysign(np.cbrt((1.0 - 2.0 / a) / np.abs(denominator)), denominator)
+    z = np.where(denominator == 0.0, math.nan, (1.0 - 2.0 / (9.0 * a) - term) / math.sqrt(2.0 / (9.0 * a)))
+    return cast("_Numbers", z)

@@ -81,6 +81,15 @@ def null_p(table: NullTable, statistic: float, num_values: int) -> float:
     return math.exp(float(log_p[-1]) + slope * (statistic**2 - float(knots[-1]) ** 2))
 
 
+def null_p_of_stack(table: NullTable, statistics: FloatArray, num_values: int) -> FloatArray:
+    """Return `null_p` of the statistics (B,) of samples of one size."""
+    if num_values < load(table).num_values[0]:
+        return np.full(statistics.shape, math.nan)
+    knots, log_p, slope = _curve(table, num_values)
+    beyond = log_p[-1] + slope * (statistics**2 - knots[-1] ** 2)
+    return np.exp(np.where(statistics <= knots[-1], np.interp(statistics, knots, log_p), beyond))
+
+
 @cache
 def load(table: NullTable) -> QuantileTable:
     """Read a packaged table. After the comments: p of each column, then N and its quantiles."""

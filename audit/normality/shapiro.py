@@ -76,6 +76,29 @@ def shapiro_wilk_sorted(values_sorted: FloatArray) -> Outcome:
     return Outcome(1.0 - one_minus_w, _royston_p(one_minus_w, num_values))
 
 
+def shapiro_wilk_of_stack(values_sorted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return W and p (B,) each of samples (B, N) in ascending order, 4 <= N <= 5000, in range and not all equal."""
+    num_values = values_sorted.shape[1]
+    weights = _half_weights(num_values)
+    half = len(weights)
+    projection = (values_sorted[:, : -half - 1 : -1] - values_sorted[:, :half]) @ weights
+    deviation = values_sorted - values_sorted.mean(axis=1, keepdims=True)
+    total = np.sqrt((deviation * deviation).sum(axis=1))
+    norm = math.sqrt(2.0 * float(weights @ weights))
+    one_minus_w = np.maximum(0.0, (norm * total - projection) * (norm * total + projection) / (norm * total) ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        y = np.log(one_minus_w)
+        if num_values <= 11:
+            gamma = _polynomial(_GAMMA, num_values)
+            mean, sd = _polynomial(_MEAN_SMALL, num_values), math.exp(_polynomial(_LOG_SD_SMALL, num_values))
+            p = np.where(y >= gamma, 0.0, special.ndtr((mean + np.log(gamma - y)) / sd))
+        else:
+            log_n = math.log(num_values)
+            mean, sd = _polynomial(_MEAN_LARGE, log_n), math.exp(_polynomial(_LOG_SD_LARGE, log_n))
+            p = special.ndtr((mean - y) / sd)
+    return 1.0 - one_minus_w, np.where(one_minus_w == 0.0, 1.0, p)
+
+
 @lru_cache(maxsize=64)
 def _half_weights(n: int) -> FloatArray:
     """Royston's approximate weights of the n // 2 largest values, largest first; all positive."""
