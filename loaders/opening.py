@@ -60,7 +60,12 @@ def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> SparseModel:
 
     Raises
     ------
+    TypeError
+        ``reconstruction`` is none.
     LoadError
         A camera model or an image size that the tables do not know.
     """
+    if not hasattr(reconstruction, "reg_image_ids"):
+        got = type(reconstruction).__name__
+        raise TypeError(f"reconstruction: expected a pycolmap.Reconstruction, found {got}; open_model reads a path")
     return assemble(in_memory.raw_model(reconstruction), in_memory.WHERE, IN_MEMORY)

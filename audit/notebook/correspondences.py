@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 NamedCamera = tuple[str, int, int, Sequence[float]]
+_MAX_SIDE: Final = 2**32
 _ORTHONORMAL: Final = 1e-6  # a rotation that was stored in float32 is off by 1e-7
 
 
@@ -86,10 +87,18 @@ def _points(xy: ArrayLike, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 
 def _array(values: ArrayLike, name: str) -> FloatArray:
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name}: expected numbers without a mask, found masked ones; leave their rows out")
     try:
-        return np.ascontiguousarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected numbers in rows of one length, {error}") from None
+        given = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name}: expected numbers in rows of one length, found other lengths") from None
+    if given.dtype.kind == "O" and given.size and all(isinstance(each, int | float | np.number) for each in given.flat):
+        given = given.astype(np.float64)
+    if given.dtype.kind not in "iuf":
+        found = type(values).__name__ if given.ndim == 0 else f"an array of {given.dtype}"
+        raise ValueError(f"{name}: expected numbers in rows of one length, found {found}")
+    return np.ascontiguousarray(given, dtype=np.float64)
 
 
 def _is_of(value: Any, name: str) -> bool:
@@ -118,14 +127,15 @@ def _camera(camera: Any) -> CameraRecord:
         return camera
     if _is_of(camera, "Camera"):
         camera = camera.model.name, camera.width, camera.height, camera.params
-    try:
-        model_name, width, height, params = camera
-    except (TypeError, ValueError):
+    if not isinstance(camera, list | tuple) or len(camera) != 4:
         wanted = "a CameraRecord, a pycolmap.Camera, or (model, width, height, params)"
-        raise ValueError(f"camera: expected {wanted}, found {type(camera).__name__}") from None
-    model = BY_NAME.get(str(model_name))
+        raise ValueError(f"camera: expected {wanted}, found {type(camera).__name__}")
+    model_name, width, height, params = camera
+    model = BY_NAME.get(str(getattr(model_name, "name", model_name)))
     if model is None:
-        raise ValueError(f"camera: expected a model of COLMAP's ({', '.join(BY_NAME)}), found {model_name!r}")
+        raise ValueError(f"camera: expected a model of COLMAP's ({', '.join(BY_NAME)}), found {model_name!r:.60}")
+    if not all(isinstance(side, int | np.integer) and 0 < side < _MAX_SIDE for side in (width, height)):
+        raise ValueError(f"camera: expected a width and a height in whole px, found {width!r:.40} and {height!r:.40}")
     values = _array(params, "camera")
     if values.shape != (model.num_params,):
         names = " ".join(model.param_names)

@@ -103,7 +103,9 @@ def _model_of(source: Any) -> tuple[SparseModel, ModelLabels]:
     if pycolmap is not None and isinstance(source, pycolmap.Reconstruction):
         model = from_pycolmap(source)
     if not isinstance(model, SparseModel):
-        raise TypeError(f"source: expected a path, a SparseModel or a pycolmap.Reconstruction, found {type(source)}")
+        raise TypeError(
+            f"source: expected a path, a SparseModel or a pycolmap.Reconstruction, found {type(source).__name__}"
+        )
     return model, ModelLabels("", "", "0", model.location)
 
 

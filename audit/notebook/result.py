@@ -92,7 +92,11 @@ class ReconstructionAudit:
         ------
         KeyError
             There is no such image, or more than one.
+        TypeError
+            ``name`` is no text.
         """
+        if not isinstance(name, str):
+            raise TypeError(f"name: expected an image's name or id:<image_id> as text, found {name!r:.40}")
         names = self.model.images.name
         same = [i for i, each in enumerate(names) if each == name]
         if len(same) > 1:
@@ -174,9 +178,19 @@ class ImageResult:
         -------
         matplotlib.axes.Axes
             The axes that were drawn into: x to the right, y down, px.
-        """
-        from sfm_audit.audit.notebook.pictures import plot_residuals  # noqa: PLC0415 - needs an extra
 
+        Raises
+        ------
+        ModuleNotFoundError
+            matplotlib is not installed.
+        """
+        try:
+            from sfm_audit.audit.notebook.pictures import plot_residuals  # noqa: PLC0415 - needs an extra
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] != "matplotlib":
+                raise
+            wanted = "plot() draws with matplotlib, which is not installed: pip install 'sfm-audit[report]'"
+            raise ModuleNotFoundError(wanted, name=error.name) from None
         with quietly():
             residuals = image_residuals_of(self._auditor, self._image_idx, self.row)
         return plot_residuals(residuals, ax, brief_image(self.row, codes=[]), magnify)

@@ -26,7 +26,7 @@ from sfm_audit.loaders.foreign.tables import Links, PlacedImage, Structure, assu
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
-from sfm_audit.loaders.paths.text_lines import read_text
+from sfm_audit.loaders.paths.text_lines import check_text, read_text
 
 PATTERN: Final = "problem-*.txt"
 _ADVICE: Final = "check that this is a problem of Bundle Adjustment in the Large, or download it again"
@@ -83,4 +83,9 @@ def count_images(folder: InputPath) -> int:
     return int(words[0])
 
 
-BAL: Final = ModelFormat(name="bal", required=(PATTERN,), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where the file is no text; nothing behind the first NUL byte is read."""
+    check_text(only_file(folder, PATTERN), _ADVICE)
+
+
+BAL: Final = ModelFormat(name="bal", required=(PATTERN,), read=read, count_images=count_images, check=check)

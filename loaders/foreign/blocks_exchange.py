@@ -32,7 +32,7 @@ from sfm_audit.loaders.foreign.lens import camera_of
 from sfm_audit.loaders.foreign.one_file import only_file
 from sfm_audit.loaders.foreign.rotations import quats_from_matrices, rotate
 from sfm_audit.loaders.foreign.tables import Links, PlacedImage, Structure, raw_model
-from sfm_audit.loaders.foreign.xml_file import Element, read_xml
+from sfm_audit.loaders.foreign.xml_file import Element, check_size, read_xml
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.locations import InputPath
 from sfm_audit.loaders.paths.text_lines import is_number
@@ -241,4 +241,11 @@ def count_images(folder: InputPath) -> int:
     return len(_read(only_file(folder, PATTERN)).photo_ids)
 
 
-BLOCKS_EXCHANGE: Final = ModelFormat(name="blocks_exchange", required=(PATTERN,), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where the file is too large to be read."""
+    check_size(only_file(folder, PATTERN))
+
+
+BLOCKS_EXCHANGE: Final = ModelFormat(
+    name="blocks_exchange", required=(PATTERN,), read=read, count_images=count_images, check=check
+)

@@ -30,7 +30,7 @@ from sfm_audit.loaders.model import Finding
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.files import exists, open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
-from sfm_audit.loaders.paths.text_lines import is_number, read_text, repr_token
+from sfm_audit.loaders.paths.text_lines import check_text, is_number, read_text, repr_token
 
 FILE: Final = "bundle.out"
 LISTS: Final = ("list.txt", "bundle.list.txt")
@@ -121,4 +121,13 @@ def count_images(folder: InputPath) -> int:
     return int(words[0])
 
 
-BUNDLER: Final = ModelFormat(name="bundler", required=(FILE,), optional=LISTS, read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where a file is no text; nothing behind the first NUL byte is read."""
+    for name in (FILE, *LISTS):
+        if exists(folder / name):
+            check_text(folder / name, _ADVICE)
+
+
+BUNDLER: Final = ModelFormat(
+    name="bundler", required=(FILE,), optional=LISTS, read=read, count_images=count_images, check=check
+)

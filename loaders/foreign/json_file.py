@@ -27,11 +27,12 @@ def read_json(path: InputPath, advice: str) -> Any:
         As of `open_input`; MalformedFileError where the file is too large, no JSON, nested too deeply, or names a key
         of an object twice.
     """
+    check_size(path)
     file, size = open_input(path)
     with file, reading(path):
-        content = b"" if size > MAX_BYTES else file.read(MAX_BYTES + 1)
-    if size > MAX_BYTES or len(content) > MAX_BYTES:
-        raise MalformedFileError(str(path), None, f"at most {MAX_BYTES} bytes of JSON", f"{size}", "split the model")
+        content = file.read(min(size, MAX_BYTES) + 1)  # all that is asked for is allocated
+    if len(content) > MAX_BYTES:
+        raise _too_large(path, size)
     num_values = sum(content.count(mark) for mark in (b",", b"[", b"{"))
     if num_values > MAX_VALUES:
         raise MalformedFileError(str(path), None, f"at most {MAX_VALUES} values", f"{num_values}", "split the model")
@@ -43,6 +44,18 @@ def read_json(path: InputPath, advice: str) -> Any:
         raise MalformedFileError(str(path), None, "JSON", "values nested too deeply", advice) from None
     except ValueError as error:  # no UTF-8, a key twice, an integer of thousands of digits
         raise MalformedFileError(str(path), None, "JSON in UTF-8", str(error)[:120], advice) from None
+
+
+def check_size(path: InputPath) -> None:
+    """Raise MalformedFileError for a file that is too large to be read; other errors as of `open_input`."""
+    file, size = open_input(path, only_head=True)
+    file.close()
+    if size > MAX_BYTES:
+        raise _too_large(path, size)
+
+
+def _too_large(path: InputPath, size: int) -> MalformedFileError:
+    return MalformedFileError(str(path), None, f"at most {MAX_BYTES} bytes of JSON", f"{size}", "split the model")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

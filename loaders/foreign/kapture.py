@@ -18,6 +18,8 @@ Facts, of "kapture format specifications" (naver/kapture, kapture_format.adoc) a
 from __future__ import annotations
 
 from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -33,7 +35,7 @@ from sfm_audit.loaders.model import Finding
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.files import exists, open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
-from sfm_audit.loaders.paths.text_lines import TextFile, parse_floats, parse_uint, read_text, repr_token
+from sfm_audit.loaders.paths.text_lines import TextFile, check_text, parse_floats, parse_uint, read_text, repr_token
 
 POINTS: Final = "points3d.txt"
 OBSERVATIONS: Final = "observations.txt"
@@ -44,6 +46,7 @@ RIGS: Final = "../sensors/rigs.txt"
 KEYPOINTS: Final = "keypoints"
 _ADVICE: Final = "check that this is kapture's format 1.1, or convert it again"
 _NO_CAMERA: Final = 2**32 - 1
+_MAX_BYTES: Final = 1 << 30  # of the keypoints of one image
 _Pose = tuple[float, ...]
 
 
@@ -243,13 +246,29 @@ class _Keypoints:
     def _read(self, kind: bytes, image: bytes) -> FloatArray:
         dtype, dsize = self._types[kind]
         path = self._below(kind, image + b".kpt")
-        file, size = open_input(path, may_be_empty=True)
+        file, size = _open_keypoints(path)
         with file, reading(path):
-            content = file.read()
+            content = file.read(min(size, _MAX_BYTES))
         if len(content) % (dtype.itemsize * dsize):
             wanted = f"rows of {dsize} numbers of {dtype.itemsize} bytes"
             raise MalformedFileError(str(path), Position("byte", size), wanted, f"{len(content)} bytes", _ADVICE)
         return np.frombuffer(content, dtype).reshape(-1, dsize)[:, :2].astype(np.float64)
+
+
+def _open_keypoints(path: InputPath) -> tuple[BufferedReader, int]:
+    file, size = open_input(path, may_be_empty=True)
+    if size > _MAX_BYTES:
+        file.close()
+        raise MalformedFileError(str(path), None, f"at most {_MAX_BYTES} bytes of keypoints", f"{size}", _ADVICE)
+    return file, size
+
+
+def check(folder: InputPath) -> None:
+    """Raise LoadError where a file of text is none, or one of keypoints too large."""
+    for name in (POINTS, OBSERVATIONS, SENSORS, RECORDS, TRAJECTORIES):
+        check_text(folder / name, _ADVICE, may_be_empty=True)
+    for name in KAPTURE.below(folder) if isinstance(folder, Path) else ():
+        _open_keypoints(folder / name)[0].close()
 
 
 def count_images(folder: InputPath) -> int:
@@ -264,4 +283,5 @@ KAPTURE: Final = ModelFormat(
     folders=(KEYPOINTS,),
     read=read,
     count_images=count_images,
+    check=check,
 )

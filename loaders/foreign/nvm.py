@@ -36,7 +36,7 @@ from sfm_audit.loaders.foreign.tables import Links, PlacedImage, Structure, assu
 from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.locations import InputPath
-from sfm_audit.loaders.paths.text_lines import TextFile, parse_floats, parse_uint, read_text, repr_token
+from sfm_audit.loaders.paths.text_lines import TextFile, check_text, parse_floats, parse_uint, read_text, repr_token
 
 PATTERN: Final = "*.nvm"
 _ADVICE: Final = "check that this is VisualSFM's file of version 3, or save it again"
@@ -186,4 +186,9 @@ def count_images(folder: InputPath) -> int:
     return total
 
 
-NVM: Final = ModelFormat(name="nvm", required=(PATTERN,), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where the file is no text; nothing behind the first NUL byte is read."""
+    check_text(only_file(folder, PATTERN), _ADVICE)
+
+
+NVM: Final = ModelFormat(name="nvm", required=(PATTERN,), read=read, count_images=count_images, check=check)

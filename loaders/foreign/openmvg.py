@@ -27,7 +27,7 @@ import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.assembly.raw import RawCamera, RawModel
-from sfm_audit.loaders.foreign.json_file import JsonPlace, read_json, rows
+from sfm_audit.loaders.foreign.json_file import JsonPlace, check_size, read_json, rows
 from sfm_audit.loaders.foreign.lens import camera_of
 from sfm_audit.loaders.foreign.rotations import quats_from_matrices, rotate
 from sfm_audit.loaders.foreign.tables import Links, PlacedImage, Structure, raw_model
@@ -230,4 +230,9 @@ def count_images(folder: InputPath) -> int:
     return len(JsonPlace(path, _ADVICE, read_json(path, _ADVICE)).get("views").items())
 
 
-OPENMVG: Final = ModelFormat(name="openmvg", required=(FILE,), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where the file is too large to be read."""
+    check_size(folder / FILE)
+
+
+OPENMVG: Final = ModelFormat(name="openmvg", required=(FILE,), read=read, count_images=count_images, check=check)

@@ -25,6 +25,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt64Array
 from sfm_audit.loaders.assembly.raw import RawCamera, RawModel
@@ -32,15 +33,17 @@ from sfm_audit.loaders.foreign.openmvg import COEFFICIENTS, Poses, View, camera,
 from sfm_audit.loaders.foreign.portable_binary import PortableBinary
 from sfm_audit.loaders.foreign.tables import Links, Structure, raw_model
 from sfm_audit.loaders.model_format import ModelFormat
+from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
 
 FILE: Final = "sfm_data.bin"
 _ADVICE: Final = "write OpenMVG's sfm_data.bin again, or convert it (openMVG_main_ConvertSfM_DataFormat)"
-_HEAD_BYTES: Final = 1 << 18
+_PIECE: Final = 1 << 20  # of the observations of one point, 32 bytes each
 _LEAST_VIEW: Final = 44
 _LEAST_CAMERA: Final = 44
 _POSE_BYTES: Final = 140
 _LANDMARK: Final = "IQ3dQ"
+_PRIOR: Final = "BQ3dQ3d"
 _VERSIONS: Final = ("0.1", "0.2", "0.3")
 _T = TypeVar("_T")
 
@@ -57,7 +60,13 @@ class _Landmarks(NamedTuple):
 
 def read(folder: InputPath) -> RawModel:
     """Read ``sfm_data.bin``; LoadError where that cannot be done."""
-    archive = PortableBinary(folder / FILE, _ADVICE)
+    path = folder / FILE
+    file, size = open_input(path)
+    with file, reading(path):
+        return _read(PortableBinary(path, file, size, _ADVICE))
+
+
+def _read(archive: PortableBinary) -> RawModel:
     version = _head(archive)
     views = _map(archive, "views", _LEAST_VIEW, _Views(archive, has_kinds=version == "0.3").read)
     cameras = _map(archive, "intrinsics", _LEAST_CAMERA, _Cameras(archive).read)
@@ -140,11 +149,12 @@ class _Views:
     def _skip_prior(self) -> None:
         """Step over a prior where there is one: 1, and twice a size of 3 and three numbers."""
         archive = self._archive
-        layout = struct.Struct(archive.order + "BQ3dQ3d")
-        if archive.num_left >= layout.size:
-            fields = layout.unpack_from(archive.data, archive.at)
+        layout = struct.Struct(archive.order + _PRIOR)
+        ahead = archive.peek(layout.size)
+        if len(ahead) == layout.size:
+            fields = layout.unpack(ahead)
             if (fields[0], fields[1], fields[5]) == (1, 3, 3):
-                archive.at += layout.size
+                archive.take(_PRIOR, "a prior")
 
 
 class _Cameras:
@@ -175,47 +185,63 @@ class _Cameras:
 
 def _landmarks(archive: PortableBinary, what: str) -> _Landmarks:
     """Return points with their observations."""
-    order, data = archive.order, archive.data
+    order = archive.order
     layout = struct.Struct(order + _LANDMARK)
     seen_as = np.dtype(
-        [("view", order + "u4"), ("feature", order + "u4"), ("size", order + "u8"), ("x", order + "f8", 2)]
+        [("view", order + "u4"), ("unused", order + "u4"), ("size", order + "u8"), ("x", order + "f8", 2)]
     )
     count = archive.count(what, layout.size)
-    heads, starts = [], []
+    heads, parts, starts = [], [], []
     for row in range(count):
         at = archive.at
-        if archive.num_left < layout.size:
-            raise archive.truncated(at, f"point {row + 1} of {count} {what} ({layout.size} bytes)", archive.num_left)
-        head = layout.unpack_from(data, at)
-        archive.at += layout.size
+        head = layout.unpack(archive.read(layout.size, f"point {row + 1} of {count} {what}"))
         if head[1] != 3:
             raise archive.malformed(at + 4, "3 coordinates of a point", f"{head[1]}")
-        if head[5] * seen_as.itemsize > archive.num_left:
-            wanted = f"{head[5]} observations, at least {head[5] * seen_as.itemsize} bytes"
-            raise archive.truncated(at + layout.size - 8, wanted, archive.num_left)
+        num_bytes = head[5] * seen_as.itemsize
+        if num_bytes > archive.num_left:
+            wanted = f"{head[5]} observations, at least {num_bytes} bytes"
+            raise archive.truncated(archive.at - 8, wanted, archive.num_left)
         heads.append((head[0], *head[2:]))
         starts.append(archive.at)
-        archive.at += head[5] * seen_as.itemsize
+        while num_bytes > 0:
+            parts.append(archive.read(min(num_bytes, _PIECE), "observations"))
+            num_bytes -= len(parts[-1])
+            if len(parts[-1]) == _PIECE:  # zeros without end are refused before they fill the memory
+                _check_sizes(archive, np.frombuffer(parts[-1], seen_as), np.array([archive.at - _PIECE]), None)
     table = np.array(heads, np.float64).reshape(-1, 5)
     lengths = table[:, 4].astype(np.int64)
-    first = np.cumsum(lengths) - lengths
-    at_bytes = np.repeat(np.array(starts, np.int64) - seen_as.itemsize * first, lengths)
-    at_bytes += seen_as.itemsize * np.arange(len(at_bytes), dtype=np.int64)
-    windows = np.ndarray((max(0, len(data) - seen_as.itemsize + 1),), f"V{seen_as.itemsize}", data, strides=(1,))
-    found = windows[at_bytes].view(seen_as)
-    wrong = np.flatnonzero(found["size"] != 2)
-    if len(wrong):
-        at = int(at_bytes[wrong[0]]) + 8
-        raise archive.malformed(at, "2 coordinates of an observation", f"{found['size'][wrong[0]]}")
+    found = np.frombuffer(b"".join(parts), seen_as)
+    _check_sizes(archive, found, np.array(starts, np.int64), lengths)
     xy, views = found["x"].astype(np.float64).reshape(-1, 2), found["view"].astype(np.int64)
     return _Landmarks(table[:, 0].astype(np.uint64), table[:, 1:4].copy(), lengths, views, xy)
 
 
+def _check_sizes(archive: PortableBinary, found: NDArray[np.void], starts: IntArray, lengths: IntArray | None) -> None:
+    """Raise where an observation has not two coordinates; ``starts``: bytes at which runs of ``lengths`` begin."""
+    wrong = np.flatnonzero(found["size"] != 2)
+    if len(wrong):
+        row = int(wrong[0])
+        ends = np.array([len(found)]) if lengths is None else np.cumsum(lengths)
+        run = int(np.searchsorted(ends, row, side="right"))
+        at = int(starts[run]) + found.itemsize * (row - (int(ends[run - 1]) if run else 0))
+        raise archive.malformed(at + 8, "2 coordinates of an observation", f"{found['size'][row]}")
+
+
 def count_images(folder: InputPath) -> int:
     """Return the number of views that the head states, those without a pose included."""
-    archive = PortableBinary(folder / FILE, _ADVICE, _HEAD_BYTES)
-    _head(archive)
-    return archive.whole("Q", "a number of views")
+    path = folder / FILE
+    file, size = open_input(path, only_head=True)
+    with file, reading(path):
+        archive = PortableBinary(path, file, size, _ADVICE)
+        _head(archive)
+        return archive.whole("Q", "a number of views")
 
 
-OPENMVG_BINARY: Final = ModelFormat(name="openmvg_binary", required=(FILE,), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where the records do not fill the file."""
+    read(folder)
+
+
+OPENMVG_BINARY: Final = ModelFormat(
+    name="openmvg_binary", required=(FILE,), read=read, count_images=count_images, check=check
+)

@@ -22,7 +22,7 @@ Facts, of OpenSfM's documentation ("Reconstruction file format", "Geometric mode
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -30,13 +30,14 @@ import numpy as np
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.assembly.raw import RawCamera, RawModel
 from sfm_audit.loaders.camera_models import BY_NAME
-from sfm_audit.loaders.foreign.json_file import JsonPlace, read_json, rows
+from sfm_audit.loaders.foreign.json_file import JsonPlace, check_size, read_json, rows
 from sfm_audit.loaders.foreign.lens import camera_of, raw_camera
 from sfm_audit.loaders.foreign.rotations import quats_from_vectors
 from sfm_audit.loaders.foreign.tables import Links, PlacedImage, Structure, raw_model
 from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.loaders.model_format import ModelFormat
 from sfm_audit.loaders.paths.locations import InputPath
+from sfm_audit.loaders.paths.text_lines import check_text
 
 if TYPE_CHECKING:
     from sfm_audit.loaders.foreign.opensfm_tracks import Tracks
@@ -70,7 +71,7 @@ def read(folder: InputPath) -> RawModel:
         tracks,
         _rows_by_name(parts, images),
         np.array(part_of_image, np.int64),
-        _point_rows(parts, tracks, first),
+        _PointRows.build(parts, tracks, first),
         _sizes(cameras, images),
     )
     return raw_model(
@@ -96,16 +97,35 @@ def _rows_by_name(parts: list[_Part], images: list[PlacedImage]) -> dict[str, in
     return row_of
 
 
-def _point_rows(parts: list[_Part], tracks: Tracks, first: IntArray) -> IntArray:
-    """Return (parts, tracks) the row of the 3D point that a track has in a reconstruction, -1 where it has none."""
-    rows_of = np.full((len(parts), len(tracks.track_names)), -1, np.int64)
-    position = {name: row for row, name in enumerate(tracks.track_names)}
-    for number, part in enumerate(parts):
-        for row, name in enumerate(part.point_names):
-            at = position.get(name)
-            if at is not None:
-                rows_of[number, at] = first[number] + row
-    return rows_of
+@dataclass(frozen=True, slots=True, eq=False)
+class _PointRows:
+    """Which 3D point does a track have in a reconstruction? key: (P,) sorted. row: (P,) of the 3D points."""
+
+    key: IntArray
+    row: IntArray
+    num_tracks: int
+
+    @classmethod
+    def build(cls, parts: list[_Part], tracks: Tracks, first: IntArray) -> _PointRows:
+        """Number the points of all reconstructions; ``first``: row of the first point of each."""
+        position = {name: row for row, name in enumerate(tracks.track_names)}
+        num_tracks = len(position)
+        pairs = [
+            (number * num_tracks + position[name], first[number] + row)
+            for number, part in enumerate(parts)
+            for row, name in enumerate(part.point_names)
+            if name in position
+        ]
+        table = np.array(sorted(pairs), np.int64).reshape(-1, 2)
+        return cls(table[:, 0].copy(), table[:, 1].copy(), num_tracks)
+
+    def of(self, part: IntArray, track_idx: IntArray) -> IntArray:
+        """Return the row of the 3D point of each track in each reconstruction, -1 where it has none."""
+        if not len(self.key):
+            return np.full(len(part), -1, np.int64)
+        wanted = part * self.num_tracks + track_idx
+        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        return np.where(self.key[at] == wanted, self.row[at], -1)
 
 
 def _sizes(cameras: list[RawCamera], images: list[PlacedImage]) -> FloatArray:
@@ -191,7 +211,7 @@ def _links(
     tracks: Tracks,
     row_of: Mapping[str, int],
     part_of_image: IntArray,
-    point_rows: IntArray,
+    point_rows: _PointRows,
     sizes: FloatArray,
 ) -> tuple[Links, IntArray]:
     """Return the observations of 3D points, and how many others every image has."""
@@ -199,7 +219,7 @@ def _links(
     image_idx = image_row[tracks.image_idx] if len(image_row) else np.empty(0, np.int64)
     is_known = image_idx >= 0
     image_idx, track_idx = image_idx[is_known], tracks.track_idx[is_known]
-    points = point_rows[part_of_image[image_idx], track_idx] if len(image_idx) else np.empty(0, np.int64)
+    points = point_rows.of(part_of_image[image_idx], track_idx)
     is_linked = points >= 0
     unlinked = np.bincount(image_idx[~is_linked], minlength=len(sizes))
     size = sizes[image_idx[is_linked]]
@@ -212,4 +232,10 @@ def count_images(folder: InputPath) -> int:
     return sum(len(place.get("shots").objects()) for place in _parts(folder / FILE))
 
 
-OPENSFM: Final = ModelFormat(name="opensfm", required=(FILE, TRACKS), read=read, count_images=count_images)
+def check(folder: InputPath) -> None:
+    """Raise LoadError where a file is too large to be read, or no text."""
+    check_size(folder / FILE)
+    check_text(folder / TRACKS, _ADVICE)
+
+
+OPENSFM: Final = ModelFormat(name="opensfm", required=(FILE, TRACKS), read=read, count_images=count_images, check=check)

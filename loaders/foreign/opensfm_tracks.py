@@ -15,6 +15,7 @@ from sfm_audit.loaders.errors import MalformedFileError
 from sfm_audit.loaders.model import Finding, FindingCode
 from sfm_audit.loaders.paths.files import read_bytes
 from sfm_audit.loaders.paths.locations import InputPath
+from sfm_audit.loaders.paths.text_lines import check_text
 
 _HEADER: Final = b"OPENSFM_TRACKS_VERSION_v"
 _WIDTHS: Final = {0: 8, 1: 9, 2: 11}
@@ -36,6 +37,7 @@ class Tracks:
 
 def read_tracks(path: InputPath) -> Tracks:
     """Read ``tracks.csv``; LoadError where that cannot be done."""
+    check_text(path, _ADVICE)  # a file of zeros ends there, before it is in memory
     content = read_bytes(path)
     head, _, rest = content.partition(b"\n")
     version = 0

@@ -13,13 +13,13 @@ Facts, of cereal 1.3 (``cereal/archives/portable_binary.hpp``, ``types/*.hpp``, 
 from __future__ import annotations
 
 import struct
+from io import BufferedReader
 from typing import Final
 
 import numpy as np
 
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.errors import LoadError, MalformedFileError, Position, TruncatedFileError
-from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath
 
 NEW: Final = 0x80000000
@@ -29,38 +29,54 @@ _ORDERS: Final = {1: "<", 0: ">"}
 
 
 class PortableBinary:
-    """A position in such a file.
+    """A position in such a file; what was read is not kept.
 
     Parameters
     ----------
     path : the file
+    file, size : as `open_input` gives them
     advice : what the user can do where it is none, or damaged
-    max_bytes : how much of it is read; None for all of it
 
     Raises
     ------
     LoadError
-        As of `open_input`; MalformedFileError where the first byte is none of an archive.
+        Where the first byte is none of an archive.
     """
 
-    def __init__(self, path: InputPath, advice: str, max_bytes: int | None = None) -> None:
-        file, _ = open_input(path, only_head=max_bytes is not None)
-        with file, reading(path):
-            self.data: Final = file.read() if max_bytes is None else file.read(max_bytes)
+    def __init__(self, path: InputPath, file: BufferedReader, size: int, advice: str) -> None:
         self.path: Final = path
         self.advice: Final = advice
+        self.size: Final = size
         self.at = 0
+        self._file = file
+        self._ahead = b""
         self._kinds: dict[int, str] = {}
-        first = self.data[0]
+        first = self.read(1, "the order of bytes")[0]
         if first not in _ORDERS:
             raise self.malformed(0, "cereal's mark of the order of bytes, 0 or 1", f"{first}")
         self.order: Final = _ORDERS[first]
-        self.at = 1
 
     @property
     def num_left(self) -> int:
         """How many bytes follow."""
-        return len(self.data) - self.at
+        return self.size - self.at
+
+    def peek(self, num_bytes: int) -> bytes:
+        """Return the next bytes, as many as there are, and stay before them."""
+        if len(self._ahead) < num_bytes:
+            self._ahead += self._file.read(num_bytes - len(self._ahead))
+        return self._ahead[:num_bytes]
+
+    def read(self, num_bytes: int, what: str) -> bytes:
+        """Return the next bytes; TruncatedFileError where there are fewer."""
+        if self._ahead:
+            found, self._ahead = self.peek(num_bytes), self._ahead[num_bytes:]
+        else:
+            found = self._file.read(num_bytes)
+        if len(found) < num_bytes:
+            raise self.truncated(self.at, f"{what} ({num_bytes} bytes)", len(found))
+        self.at += num_bytes
+        return found
 
     def malformed(self, at: int, wanted: str, got: str) -> LoadError:
         """Return the error for what stands at a byte."""
@@ -75,11 +91,7 @@ class PortableBinary:
     def take(self, codes: str, what: str) -> tuple[float, ...]:
         """Return the numbers that `struct` codes name."""
         layout = struct.Struct(self.order + codes)
-        if self.num_left < layout.size:
-            raise self.truncated(self.at, f"{what} ({layout.size} bytes)", self.num_left)
-        found = layout.unpack_from(self.data, self.at)
-        self.at += layout.size
-        return found
+        return layout.unpack(self.read(layout.size, what))
 
     def whole(self, code: str, what: str) -> int:
         """Return one whole number."""
@@ -98,9 +110,7 @@ class PortableBinary:
         at, size = self.at, self.count(f"characters of {what}", 1)
         if size > _MAX_TEXT:
             raise self.malformed(at, f"at most {_MAX_TEXT} characters of {what}", f"{size}")
-        found = self.data[self.at : self.at + size]
-        self.at += size
-        return found.decode("utf-8", errors="backslashreplace")
+        return self.read(size, what).decode("utf-8", errors="backslashreplace")
 
     def vector(self, length: int, what: str) -> tuple[float, ...]:
         """Return a vector of doubles that must have so many."""
@@ -135,5 +145,5 @@ class PortableBinary:
 
     def finish(self, what: str) -> None:
         """Raise where bytes follow."""
-        if self.num_left:
+        if self.peek(1):
             raise self.malformed(self.at, f"the end of the file after {what}", f"{self.num_left} more bytes")

@@ -19,8 +19,10 @@ from sfm_audit.loaders.paths.locations import InputPath
 MAX_BYTES: Final = 1 << 33
 MAX_DEPTH: Final = 64
 MAX_TEXT: Final = 1 << 16
-MAX_CHILDREN: Final = 1 << 20
-"""Of one element that is kept whole; lists of such elements may be longer."""
+MAX_KEPT: Final = 1 << 20
+"""Elements that are kept at a time; elements that are handed over are not kept, so lists of them may be longer."""
+MAX_MARKUP: Final = 1 << 23
+"""Bytes of one tag or comment: expat keeps what has no end yet."""
 _PIECE: Final = 1 << 20
 
 
@@ -32,6 +34,7 @@ class Element:
     line: int
     text: str = ""
     children: list[Element] = field(default_factory=list)
+    num_below: int = 0
 
     def find(self, name: str) -> Element | None:
         """Return the first child of that name."""
@@ -60,6 +63,7 @@ class _Builder:
         self._take = take
         self._hand = hand
         self._stack: list[Element] = []
+        self._num_kept = 0
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
         self.parser.StartElementHandler = self._start
@@ -82,11 +86,14 @@ class _Builder:
         element = self._stack.pop()
         if element.name in self._take:
             self._hand(element)
+            self._num_kept -= element.num_below
         elif self._stack:
-            siblings = self._stack[-1].children
-            if len(siblings) >= MAX_CHILDREN:
-                raise _Refused(f"at most {MAX_CHILDREN} elements in <{self._stack[-1].name[:40]}>", "more")
-            siblings.append(element)
+            parent = self._stack[-1]
+            parent.children.append(element)
+            parent.num_below += 1 + element.num_below
+            self._num_kept += 1
+            if self._num_kept > MAX_KEPT:
+                raise _Refused(f"at most {MAX_KEPT} elements in those that have no end yet", "more")
 
     def _text(self, text: str) -> None:
         if self._stack and not text.isspace():  # blanks between elements would grow with the file
@@ -108,6 +115,14 @@ class _Builder:
         raise _Refused("XML without entities of its own", "an entity elsewhere")
 
 
+def check_size(path: InputPath) -> None:
+    """Raise MalformedFileError for a file that is too large to be read; other errors as of `open_input`."""
+    file, size = open_input(path, only_head=True)
+    file.close()
+    if size > MAX_BYTES:
+        raise MalformedFileError(str(path), None, f"at most {MAX_BYTES} bytes of XML", f"{size}", "split the block")
+
+
 def read_xml(path: InputPath, root: str, take: frozenset[str], hand: Callable[[Element], None], advice: str) -> None:
     """Parse a file and hand over every element whose name is in ``take``, children first; they are not kept.
 
@@ -118,14 +133,16 @@ def read_xml(path: InputPath, root: str, take: frozenset[str], hand: Callable[[E
         holds what is refused here; errors of ``hand``.
     """
     builder = _Builder(root, take, hand)
-    file, size = open_input(path)
-    if size > MAX_BYTES:
-        file.close()
-        raise MalformedFileError(str(path), None, f"at most {MAX_BYTES} bytes of XML", f"{size}", "split the block")
+    check_size(path)
+    file, _ = open_input(path)
     with file, reading(path):
         try:
+            num_read = 0
             while piece := file.read(_PIECE):
                 builder.parser.Parse(piece, False)
+                num_read += len(piece)
+                if num_read - builder.parser.CurrentByteIndex > MAX_MARKUP:
+                    raise _Refused(f"tags and comments of at most {MAX_MARKUP} bytes", "a longer one")  # noqa: TRY301
             builder.parser.Parse(b"", True)
         except expat.ExpatError as error:
             got = expat.ErrorString(error.code) or "no XML"

@@ -279,6 +279,20 @@ WRONG = [
     ({"camera": ("PINHOLLE", 1, 1, (1,))}, r"^camera: expected a model of COLMAP's \(SIMPLE_PINHOLE, .* 'PINHOLLE'$"),
     ({"camera": ("PINHOLE", 1, 1, (1,))}, r"^camera: expected 4 parameters of PINHOLE \(fx fy cx cy\), found \(1,\)$"),
     ({"camera": 500.0}, "^camera: expected a CameraRecord, a pycolmap.Camera, or .*, found float$"),
+    ({"camera": {"model": "PINHOLE"}}, "^camera: expected a CameraRecord, .*, found dict$"),
+    ({"camera": np.eye(4)}, "^camera: expected a CameraRecord, .*, found ndarray$"),
+    ({"camera": ("PINHOLE", np.nan, 960, (1.0,) * 4)}, "^camera: expected a width and a height in whole px, found nan"),
+    (
+        {"camera": ("PINHOLE", "wide", 960, (1.0,) * 4)},
+        "^camera: expected a width and a height .* found 'wide' and 960",
+    ),
+    ({"camera": ("PINHOLE", 1280, -5, (1.0,) * 4)}, "^camera: expected a width and a height .* found 1280 and -5$"),
+    ({"xy": np.zeros((5, 2), complex)}, "^xy: expected numbers .*, found an array of complex128$"),
+    ({"xy": np.ones((5, 2), bool)}, "^xy: expected numbers .*, found an array of bool$"),
+    ({"xy": [["1", "2"]]}, "^xy: expected numbers .*, found an array of <U1$"),
+    ({"xy": None}, "^xy: expected numbers .*, found NoneType$"),
+    ({"xyz": np.ma.masked_less(np.eye(3), 0.5)}, "^xyz: expected numbers without a mask, found masked ones; leave"),
+    ({"pose": (np.eye(3), np.zeros(3))}, "^pose: expected numbers in rows of one length, found other lengths$"),
 ]
 
 
@@ -287,6 +301,33 @@ def test_a_wrong_array_is_named(arrays, changed, message):
     given = dict(zip(("xy", "xyz", "camera", "pose"), arrays, strict=True)) | changed
     with pytest.raises(ValueError, match=message):
         audit_correspondences(**given)
+
+
+def test_what_is_odd_and_still_an_array_is_audited(arrays):
+    xy, xyz, camera, pose = arrays
+    wanted = audit_correspondences(xy, xyz, camera, pose).residuals_px
+    named = (pycolmap.CameraModelId.OPENCV, *map(np.int32, SIZE), CAMERA[3])
+    odd = audit_correspondences(xy.astype(object), np.ma.asarray(np.asfortranarray(xyz)), named, pose)
+    np.testing.assert_array_equal(odd.residuals_px, wanted)
+    none = audit_correspondences(np.empty((0, 2)), np.empty((0, 3)), camera, pose)
+    assert "undetermined" in repr(none)
+    holes = np.where(np.arange(len(xy))[:, None] == 7, np.nan, xy)
+    assert audit_correspondences(holes, xyz, camera, pose).inliers.xy_px.shape == (len(xy) - 1, 2)
+
+
+def test_what_is_no_reconstruction_or_no_name_is_said(folder, monkeypatch):
+    with pytest.raises(TypeError, match=r"reconstruction: expected a pycolmap.Reconstruction, found str; open_model"):
+        from_pycolmap(str(folder))
+    result = audit_reconstruction(folder)
+    with pytest.raises(TypeError, match=r"name: expected an image's name or id:<image_id> as text, found 3$"):
+        result.image(3)
+    image = result.image(result.images.image_name[0])
+    for module in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "sfm_audit.audit.notebook.pictures", raising=False)
+    monkeypatch.delattr("sfm_audit.audit.notebook.pictures", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sfm-audit\[report\]'"):
+        image.plot()
 
 
 @pytest.mark.parametrize("module", [reconstruction, correspondences])
