@@ -78,8 +78,12 @@ def median_depth(camera: CameraRecord, xyz_cam: FloatArray) -> float:
     """Median Zc of (n, 3) points in the camera frame, model units; spherical cameras: median distance; NaN if none."""
     if not len(xyz_cam):
         return math.nan
-    depth = np.sqrt((xyz_cam**2).sum(axis=1)) if camera.model.is_spherical else xyz_cam[:, 2]
-    return float(np.median(depth))
+    return float(np.median(depths(camera, xyz_cam)))
+
+
+def depths(camera: CameraRecord, xyz_cam: FloatArray) -> FloatArray:
+    """Zc (n,) of points (n, 3) in the camera frame, model units; spherical cameras: their distance."""
+    return np.asarray(np.sqrt((xyz_cam**2).sum(axis=1)) if camera.model.is_spherical else xyz_cam[:, 2])
 
 
 def expected_error_map(

@@ -7,11 +7,13 @@ not, so these standard deviations are lower bounds (about 2.7 times too small in
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from sfm_audit.audit.misfit.in_parts import ColumnSums
 from sfm_audit.audit.table.thresholds import SINGULAR_SHARE
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
@@ -87,30 +89,47 @@ def parameter_covariance(columns: FloatArray, names: tuple[str, ...], sigma_px: 
     Derivatives that are not finite, or no observations, leave everything NaN.
     """
     flat = columns.reshape(len(columns), -1)
-    if len(names) != len(flat):
-        raise ValueError(f"{len(flat)} columns but {len(names)} names")
     with np.errstate(over="ignore", invalid="ignore"):
         norms = np.sqrt(np.einsum("cm,cm->c", flat, flat))
     used = np.flatnonzero(norms != 0.0)
-    if used.size < len(flat):
-        flat, norms, names = flat[used], norms[used], tuple(names[i] for i in used)
+    if not used.size or not np.isfinite(norms).all():
+        return covariance_of_sums(names, ColumnSums(norms, np.zeros((0, 0)), flat.shape[1]), sigma_px, lambda: flat)
+    unit = (flat if used.size == len(flat) else flat[used]) / norms[used, None]
+    sums = ColumnSums(norms, unit @ unit.T, flat.shape[1])
+    return covariance_of_sums(names, sums, sigma_px, lambda: np.asarray(np.linalg.qr(unit.T, mode="r")))
+
+
+def covariance_of_sums(
+    names: tuple[str, ...], sums: ColumnSums, sigma_px: float, triangle: Callable[[], FloatArray]
+) -> ParameterCovariance:
+    """Return `parameter_covariance` from what the columns add up to.
+
+    Parameters
+    ----------
+    triangle : gives R of a QR of the unit columns that are not zero; asked where their Gram matrix leaves doubts
+    """
+    norms = sums.norms
+    if len(names) != len(norms):
+        raise ValueError(f"{len(norms)} columns but {len(names)} names")
+    used = np.flatnonzero(norms != 0.0)
+    if used.size < len(norms):
+        norms, names = norms[used], tuple(names[i] for i in used)
     if not names or not np.isfinite(norms).all():
         return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), math.nan)
-    inverse_root, share = _inverse_root(flat / norms[:, None])
+    inverse_root, share = _inverse_root(sums, triangle)
     if share <= SINGULAR_SHARE:
         return ParameterCovariance(names, np.full((len(names),) * 2, np.nan), share)
     inverse_root *= sigma_px / norms[:, None]
     return ParameterCovariance(names, inverse_root @ inverse_root.T, share)
 
 
-def _inverse_root(unit: FloatArray) -> tuple[FloatArray, float]:
+def _inverse_root(sums: ColumnSums, triangle: Callable[[], FloatArray]) -> tuple[FloatArray, float]:
     """Return R, (q, q), with R R^T = (U U^T)^-1 for unit columns U (q, m), and smallest / largest singular value."""
-    if unit.shape[0] > unit.shape[1]:
-        return np.full((len(unit),) * 2, np.nan), 0.0
-    values, vectors = np.linalg.eigh(unit @ unit.T)
+    if len(sums.gram) > sums.num_values:
+        return np.full((len(sums.gram),) * 2, np.nan), 0.0
+    values, vectors = np.linalg.eigh(sums.gram)
     if values[0] <= _SMALLEST_PIVOT * values[-1]:
-        triangle = np.linalg.qr(unit.T, mode="r")
-        _, singular, rows = np.linalg.svd(triangle)
+        _, singular, rows = np.linalg.svd(triangle())
         values, vectors = singular[::-1] ** 2, rows[::-1].T
     share = math.sqrt(max(float(values[0] / values[-1]), 0.0))
     if share <= SINGULAR_SHARE:
@@ -158,8 +177,12 @@ def identifiability(camera: CameraRecord, columns: FloatArray, sigma_px: float) 
     -----
     method.md section 6; of a camera shared by many images this is what *one* image says.
     """
+    return identifiability_of(camera, parameter_covariance(columns, fitted_names(camera.model), sigma_px))
+
+
+def identifiability_of(camera: CameraRecord, parameters: ParameterCovariance) -> Identifiability:
+    """Return the same from the covariance of the parameters of `fitted_names`."""
     model, params = camera.model, camera.params
-    parameters = parameter_covariance(columns, fitted_names(model), sigma_px)
     focals = [(parameters.sd_of(model.param_names[i]), float(params[i])) for i in model.focal_idxs]
     relative = [sd / abs(focal) if focal else math.nan for sd, focal in focals]
     extra = model.extra_idxs

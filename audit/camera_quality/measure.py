@@ -3,23 +3,41 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
+
 from sfm_audit.audit.camera_quality.coverage import coverage, occupied_cells
-from sfm_audit.audit.camera_quality.expected_error import expected_error_px, grid_columns, grid_rays, median_depth
-from sfm_audit.audit.camera_quality.identifiability import Identifiability, ParameterCovariance, identifiability
+from sfm_audit.audit.camera_quality.expected_error import (
+    depths,
+    expected_error_px,
+    grid_columns,
+    grid_rays,
+    median_depth,
+)
+from sfm_audit.audit.camera_quality.identifiability import (
+    Identifiability,
+    ParameterCovariance,
+    covariance_of_sums,
+    fitted_names,
+    identifiability,
+    identifiability_of,
+)
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, camera_plausibility
 from sfm_audit.audit.inliers.projected import ImageInliers
 from sfm_audit.audit.inliers.sanity import is_usable
 from sfm_audit.audit.misfit import (
+    ImageDesign,
     MisfitTests,
     candidate_fields,
     coincident_keypoints,
     nuisance_columns,
     prepare,
 )
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.audit.misfit.in_parts import PartedImage, column_sums, column_triangle, image_tests_in_parts
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
 
 
@@ -83,22 +101,62 @@ def camera_quality(shape: CameraShape, inliers: ImageInliers, sigma_px: float, *
     """
     if not len(inliers):
         return None
-    camera, xy_px = shape.camera, inliers.xy_px
-    projected = inliers.projected
+    camera, projected = shape.camera, inliers.projected
     columns = nuisance_columns(camera.model, projected)
     known = identifiability(camera, columns, sigma_px)
     depth = median_depth(camera, inliers.xyz_cam)
-    error = math.nan
+    fields = candidate_fields(camera, projected)
+    prepared = prepare(columns, fields, clusters=coincident_keypoints(inliers.xy_px), overwrite_fields=True)
+    misfit = prepared.test(inliers.residuals_px)
+    return _quality(shape, misfit, known, depth, inliers.xy_px, sigma_px=sigma_px, grid=grid)
+
+
+def camera_quality_in_parts(
+    shape: CameraShape, part: Callable[[IntArray], ImageInliers], xy_px: FloatArray, sigma_px: float, *, grid: int
+) -> CameraQuality:
+    """Ask the same of an image whose columns do not fit into memory at once.
+
+    Parameters
+    ----------
+    part : gives chosen ones of the image's n inliers        xy_px : (n, 2) observed, of all of them
+    """
+    camera = shape.camera
+    clusters = coincident_keypoints(xy_px)
+    track = np.arange(len(xy_px)) if clusters is None else clusters
+
+    def nuisance(chosen: IntArray) -> FloatArray:
+        return nuisance_columns(camera.model, part(chosen).projected)
+
+    def design(chosen: IntArray) -> ImageDesign:
+        inliers = part(chosen)
+        projected = inliers.projected
+        fields = candidate_fields(camera, projected)
+        columns = nuisance_columns(camera.model, projected)
+        return ImageDesign(columns, columns[:0], fields, inliers.residuals_px, track[chosen])
+
+    image = PartedImage(track, nuisance, design)
+    sums = column_sums(image)
+    names = fitted_names(camera.model)
+    parameters = covariance_of_sums(names, sums, sigma_px, lambda: column_triangle(image, sums.norms))
+    depth = float(np.median(np.concatenate([depths(camera, part(chosen).xyz_cam) for chosen in image.parts()])))
+    misfit = image_tests_in_parts(image, int(track.max()) + 1)
+    known = identifiability_of(camera, parameters)
+    return _quality(shape, misfit, known, depth, xy_px, sigma_px=sigma_px, grid=grid)
+
+
+def _quality(
+    shape: CameraShape,
+    misfit: MisfitTests,
+    known: Identifiability,
+    depth: float,
+    xy_px: FloatArray,
+    *,
+    sigma_px: float,
+    grid: int,
+) -> CameraQuality:
+    camera, error = shape.camera, math.nan
     if math.isfinite(sigma_px) and not known.parameters.is_singular:
         error = shape.expected_error_px(known.parameters, sigma_px, depth)
-    fields = candidate_fields(camera, projected)
-    prepared = prepare(columns, fields, clusters=coincident_keypoints(xy_px), overwrite_fields=True)
-    return CameraQuality(
-        shape,
-        prepared.test(inliers.residuals_px),
-        known,
-        error,
-        depth,
-        coverage(xy_px, camera.width, camera.height),
-        occupied_cells(xy_px, camera.width, camera.height, grid),
-    )
+    seen = coverage(xy_px, camera.width, camera.height)
+    cells = occupied_cells(xy_px, camera.width, camera.height, grid)
+    return CameraQuality(shape, misfit, known, error, depth, seen, cells)

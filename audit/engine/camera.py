@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from sfm_audit.audit.misfit import (
     ImageDesign,
     MisfitTests,
     PooledTests,
+    ProjectedImage,
     Retest,
     advised_camera_model,
     camera_tests,
@@ -25,6 +27,7 @@ from sfm_audit.audit.misfit import (
     project_image,
     projected_design,
 )
+from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, camera_tests_in_parts
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -63,16 +66,26 @@ class _CameraImages:
     def tests(self, camera: CameraRecord, tracks: Sequence[IntArray], num_tracks: int) -> PooledTests:
         """Test as if the images had been taken with ``camera``."""
 
-        def design(k: int) -> ImageDesign:
-            own = self.inliers(k)
-            projected = own.projected if camera is self.camera else project_image(camera, own.xyz_cam)
-            return projected_design(camera, projected, own.residuals_px, tracks[k])
+        def projected(k: int, chosen: IntArray | None) -> tuple[ImageInliers, ProjectedImage]:
+            own = self.inliers(k, chosen)
+            return own, own.projected if camera is self.camera else project_image(camera, own.xyz_cam)
 
-        return camera_tests(design, len(self.image_idxs), num_tracks)
+        def design(k: int, chosen: IntArray | None = None) -> ImageDesign:
+            own, seen = projected(k, chosen)
+            track = tracks[k] if chosen is None else tracks[k][chosen]
+            return projected_design(camera, seen, own.residuals_px, track)
 
-    def inliers(self, k: int) -> ImageInliers:
-        """Inliers of the k-th image."""
-        return image_inliers(self.model, self.residuals, int(self.image_idxs[k]))
+        def pose(k: int, chosen: IntArray) -> FloatArray:
+            return projected(k, chosen)[1].pose
+
+        if max(map(len, tracks), default=0) <= AT_ONCE:
+            return camera_tests(design, len(self.image_idxs), num_tracks)
+        parted = [PartedImage(track, partial(pose, k), partial(design, k)) for k, track in enumerate(tracks)]
+        return camera_tests_in_parts(parted, num_tracks)
+
+    def inliers(self, k: int, chosen: IntArray | None = None) -> ImageInliers:
+        """Inliers of the k-th image, or some of them."""
+        return image_inliers(self.model, self.residuals, int(self.image_idxs[k]), chosen)
 
     def tracks(self) -> tuple[list[IntArray], int]:
         """Rows of each image's points in the list of this camera's points, and the length of that list."""

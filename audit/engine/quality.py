@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
-from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, camera_quality
+from sfm_audit.audit.camera_quality.measure import (
+    CameraQuality,
+    CameraShape,
+    camera_quality,
+    camera_quality_in_parts,
+)
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.misfit.in_parts import AT_ONCE
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -38,6 +45,11 @@ def quality_of_images(
         if shape is None:
             out.append(None)
             continue
-        inliers = image_inliers(model, residuals, image_idx)
-        out.append(camera_quality(shape, inliers, float(sigma_px[image_idx]), grid=grid))
+        sigma = float(sigma_px[image_idx])
+        if rows.stop - rows.start > AT_ONCE:
+            xy_px = model.observations.xy_px.take(residuals.observation_row[rows], axis=0)
+            part = partial(image_inliers, model, residuals, image_idx)
+            out.append(camera_quality_in_parts(shape, part, xy_px, sigma, grid=grid))
+        else:
+            out.append(camera_quality(shape, image_inliers(model, residuals, image_idx), sigma, grid=grid))
     return out

@@ -15,7 +15,7 @@ from sfm_audit.loaders.arrays import FloatArray
 NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md section 5, step 1)
 FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection
 MAX_LEVERAGE: Final = 1.0 - 1e-9
-_SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, the exact path
+SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, the exact path
 _SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
 _SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
 _SAFE_SQUARE: Final = 1e-280  # sums of squares between this and its inverse lost nothing to under- or overflow
@@ -70,7 +70,7 @@ def nuisance_basis(columns: FloatArray, *, exact: bool = False) -> FloatArray:
         return columns
     if not exact:
         values, vectors = np.linalg.eigh(columns @ columns.T)
-        if values[0] > _SMALLEST_PIVOT * values[-1]:
+        if values[0] > SMALLEST_PIVOT * values[-1]:
             basis = (vectors / np.sqrt(values)).T @ columns
             values, vectors = np.linalg.eigh(basis @ basis.T)
             return np.asarray((vectors / np.sqrt(values)).T @ basis, dtype=np.float64)

@@ -8,7 +8,7 @@ of intrinsics and fields after each image's own pose, a second pass the scores o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -104,14 +104,14 @@ def camera_tests(
     normal = _first_pass(designs, num_images, num_tracks)
     if isinstance(normal, MisfitStatus):
         return PooledTests({group: not_tested(normal) for group in GROUPS}, 0, 0, 0)
-    solution = None if exact else _solve_normal(normal)
+    solution = None if exact else solve_normal(normal)
     if solution is None:
-        solution = _solve_triangle(_triangle(designs, num_images, normal), normal)
+        solution = solve_triangle(triangle_of(_parts(designs, num_images), normal), normal)
     return _second_pass(designs, num_images, num_tracks, normal, solution)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
+class PooledNormal:
     """What the first pass leaves; C: the k intrinsics, E: the fields, both off the poses and of unit length before.
 
     gram: (k + 42, k + 42) of [C, E].          before: (k + 42, k + 42) the same before projection.
@@ -131,6 +131,7 @@ class _Normal:
 
     @property
     def num_intrinsics(self) -> int:
+        """K, the intrinsics in front of the fields."""
         return len(self.scale) - NUM_FIELDS
 
     def columns(self, group: MisfitGroup) -> slice:
@@ -140,7 +141,7 @@ class _Normal:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
+class PooledSolution:
     """How to go from C and E to orthonormal columns.
 
     to_basis: (k, k') C to_basis is an orthonormal basis Qc of the intrinsics.    on_basis: (k', 42) Qc^T E.
@@ -153,7 +154,7 @@ class _Solution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _OffPose:
+class OffPose:
     """One image with its pose profiled: columns (k + 42, 2n), coordinates on the pose before (k + 42, q), y (2n,)."""
 
     columns: FloatArray
@@ -163,7 +164,7 @@ class _OffPose:
     finite: BoolArray
 
 
-def _off_pose(design: ImageDesign) -> _OffPose | None:
+def _off_pose(design: ImageDesign) -> OffPose | None:
     """None where the pose's derivatives are not finite; other columns that are not are zeroed, and said so."""
     pose = basis.unit_columns(design.pose.reshape(len(design.pose), -1))
     if not np.isfinite(pose).all():
@@ -175,10 +176,10 @@ def _off_pose(design: ImageDesign) -> _OffPose | None:
     coordinates = basis.project_off_in_place(q, columns)
     basis.project_off_in_place(q, columns)
     y = basis.project_off(q, design.residuals_px.reshape(-1))
-    return _OffPose(columns, coordinates, y, np.einsum("qm,qm->m", q, q), finite)
+    return OffPose(columns, coordinates, y, np.einsum("qm,qm->m", q, q), finite)
 
 
-class _Sums:
+class PooledSums:
     """The first pass, image by image."""
 
     def __init__(self, num_intrinsics: int, num_tracks: int) -> None:
@@ -188,7 +189,8 @@ class _Sums:
         self.seen = np.zeros(num_tracks, dtype=np.bool_)
         self.num_images = self.num_observations = self.num_free = 0
 
-    def add(self, part: _OffPose, track: IntArray) -> None:
+    def add(self, part: OffPose, track: IntArray) -> None:
+        """Add an image, or a part of one (the coordinates then once), whose observations belong to ``track`` (n,)."""
         own = part.columns @ part.columns.T
         self.gram += own
         self.before += own + part.coordinates @ part.coordinates.T
@@ -199,13 +201,13 @@ class _Sums:
         self.num_observations += len(track)
         self.num_free += len(part.y) - part.coordinates.shape[1]
 
-    def normal(self) -> _Normal:
+    def normal(self) -> PooledNormal:
         """Scale to columns of unit length."""
         length = np.sqrt(np.diagonal(self.before))
         scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
         both = scale * scale[:, None]
         of_fields = self.finite[len(scale) - NUM_FIELDS :]
-        return _Normal(
+        return PooledNormal(
             self.gram * both,
             self.before * both,
             self.on_y * scale,
@@ -220,9 +222,9 @@ class _Sums:
 
 def _first_pass(
     designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int
-) -> _Normal | Literal[MisfitStatus.NO_FIELDS, MisfitStatus.NOT_FINITE, MisfitStatus.NOT_ENOUGH_EVIDENCE]:
+) -> PooledNormal | Literal[MisfitStatus.NO_FIELDS, MisfitStatus.NOT_FINITE, MisfitStatus.NOT_ENOUGH_EVIDENCE]:
     """Accumulate over images; or say why nothing can be tested."""
-    sums: _Sums | None = None
+    sums: PooledSums | None = None
     for i in range(num_images):
         design = designs(i)
         if not len(design.fields):
@@ -232,7 +234,7 @@ def _first_pass(
         part = _off_pose(design)
         if part is None or not part.finite[: len(design.intrinsics)].all():
             return MisfitStatus.NOT_FINITE
-        sums = sums or _Sums(len(design.intrinsics), num_tracks)
+        sums = sums or PooledSums(len(design.intrinsics), num_tracks)
         sums.add(part, design.track)
         del design, part  # before the next image's columns are made
     if sums is None:
@@ -240,13 +242,13 @@ def _first_pass(
     return sums.normal() if np.isfinite(sums.before).all() else MisfitStatus.NOT_FINITE
 
 
-def _largest_sq(normal: _Normal, group: MisfitGroup) -> float:
+def _largest_sq(normal: PooledNormal, group: MisfitGroup) -> float:
     """Largest squared singular value of a group before projection."""
     columns = normal.columns(group)
     return basis.largest_sq(normal.before[columns, columns])
 
 
-def _solve_normal(normal: _Normal) -> _Solution | None:
+def solve_normal(normal: PooledNormal) -> PooledSolution | None:
     """Solve through the normal matrices; None where they leave a rank in doubt."""
     k = normal.num_intrinsics
     used = normal.scale[:k] > 0
@@ -267,22 +269,28 @@ def _solve_normal(normal: _Normal) -> _Solution | None:
         if transform is None:
             return None
         transforms[group] = transform
-    return _Solution(to_basis, on_basis, transforms)
+    return PooledSolution(to_basis, on_basis, transforms)
 
 
-def _triangle(designs: Callable[[int], ImageDesign], num_images: int, normal: _Normal) -> FloatArray:
+def triangle_of(parts: Iterable[OffPose], normal: PooledNormal) -> FloatArray:
     """(k + 42, k + 42) R with R^T R the normal matrix, without squaring anything: QR of one image after the other."""
     triangle = np.zeros((0, len(normal.scale)))
+    for part in parts:
+        rows = (part.columns * normal.scale[:, None]).T
+        triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
+    return triangle
+
+
+def _parts(designs: Callable[[int], ImageDesign], num_images: int) -> Iterator[OffPose]:
+    """Image by image, without those that have no observations."""
     for i in range(num_images):
         design = designs(i)
         part = _off_pose(design) if len(design.track) else None
         if part is not None:
-            rows = (part.columns * normal.scale[:, None]).T
-            triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
-    return triangle
+            yield part
 
 
-def _solve_triangle(triangle: FloatArray, normal: _Normal) -> _Solution:
+def solve_triangle(triangle: FloatArray, normal: PooledNormal) -> PooledSolution:
     """Solve as the dense problem is solved, with the triangle in the place of the columns."""
     k = normal.num_intrinsics
     left, singular, right = np.linalg.svd(triangle[:, :k], full_matrices=False)
@@ -300,17 +308,18 @@ def _solve_triangle(triangle: FloatArray, normal: _Normal) -> _Solution:
         _, lengths, vectors = np.linalg.svd(fields[:, GROUP_COLUMNS[group]], full_matrices=False)
         sure = lengths > basis.FIELD_THRESHOLD * math.sqrt(_largest_sq(normal, group))
         transforms[group] = vectors[sure].T / lengths[sure]
-    return _Solution(right[kept].T / singular[kept], on_basis + again, transforms)
+    return PooledSolution(right[kept].T / singular[kept], on_basis + again, transforms)
 
 
 def _second_pass(
-    designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int, normal: _Normal, solution: _Solution
+    designs: Callable[[int], ImageDesign],
+    num_images: int,
+    num_tracks: int,
+    normal: PooledNormal,
+    solution: PooledSolution,
 ) -> PooledTests:
     """Sum scores and, per track, what the meat is made of; judge."""
-    k = normal.num_intrinsics
-    on_basis_y = solution.to_basis.T @ normal.on_y[:k]
-    num_fields = len(normal.scale) - k
-    per_track, scores = np.zeros((num_tracks, num_fields)), np.zeros(num_fields)
+    per_track, scores = np.zeros((num_tracks, NUM_FIELDS)), np.zeros(NUM_FIELDS)
     last_row = np.empty(num_tracks, dtype=np.int64)
     for i in range(num_images):
         design = designs(i)
@@ -319,22 +328,32 @@ def _second_pass(
             continue
         track = design.track
         del design
-        part.columns[...] *= normal.scale[:, None]
-        qc = solution.to_basis.T @ part.columns[:k]
-        fields = part.columns[k:]
-        fields -= solution.on_basis.T @ qc
-        y = part.y - on_basis_y @ qc
-        leverage = np.minimum(part.pose_leverage + np.einsum("qm,qm->m", qc, qc), basis.MAX_LEVERAGE)
-        weighted = (y / np.sqrt(1.0 - leverage)).reshape(2, -1)
-        scores += fields @ y
-        _add_rows(per_track, track, np.einsum("cin,in->nc", fields.reshape(num_fields, 2, -1), weighted), last_row)
-        del part, fields  # before the next image's columns are made
+        own_scores, per_observation = scored(part, normal, solution)
+        scores += own_scores
+        add_rows(per_track, track, per_observation, last_row)
+        del part, per_observation  # before the next image's columns are made
     meat = per_track.T @ per_track
-    tests = {group: _judged(group, scores, meat, normal, solution) for group in GROUPS}
+    tests = {group: judged(group, scores, meat, normal, solution) for group in GROUPS}
     return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)
 
 
-def _add_rows(target: FloatArray, rows: IntArray, values: FloatArray, last_row: IntArray) -> None:
+def scored(part: OffPose, normal: PooledNormal, solution: PooledSolution) -> tuple[FloatArray, FloatArray]:
+    """Return the scores (42,) of an image's columns, which are used up, and (n, 42) what its observations add to them.
+
+    The second is weighted by 1 / sqrt(1 - leverage): what the meat is made of.
+    """
+    k = normal.num_intrinsics
+    part.columns[...] *= normal.scale[:, None]
+    qc = solution.to_basis.T @ part.columns[:k]
+    fields = part.columns[k:]
+    fields -= solution.on_basis.T @ qc
+    y = part.y - (solution.to_basis.T @ normal.on_y[:k]) @ qc
+    leverage = np.minimum(part.pose_leverage + np.einsum("qm,qm->m", qc, qc), basis.MAX_LEVERAGE)
+    weighted = (y / np.sqrt(1.0 - leverage)).reshape(2, -1)
+    return fields @ y, np.einsum("cin,in->nc", fields.reshape(len(fields), 2, -1), weighted)
+
+
+def add_rows(target: FloatArray, rows: IntArray, values: FloatArray, last_row: IntArray) -> None:
     """Add values (n, c) to rows of target in place, also where a track is seen twice; last_row: scratch."""
     number = np.arange(len(rows))
     last_row[rows] = number
@@ -344,9 +363,10 @@ def _add_rows(target: FloatArray, rows: IntArray, values: FloatArray, last_row: 
         np.add.at(target, rows, values)
 
 
-def _judged(
-    group: MisfitGroup, scores: FloatArray, meat: FloatArray, normal: _Normal, solution: _Solution
+def judged(
+    group: MisfitGroup, scores: FloatArray, meat: FloatArray, normal: PooledNormal, solution: PooledSolution
 ) -> MisfitTest:
+    """Return the test of one group from the sums over all images."""
     if group in normal.refused:
         return not_tested(MisfitStatus.NOT_FINITE)
     columns, transform = GROUP_COLUMNS[group], solution.transform[group]
