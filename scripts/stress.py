@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +32,8 @@ writer: Any = importlib.import_module("model_writer")
 
 _SCALES: Final = (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9)
 _TOO_SMALL: Final = 1e-12  # a pixel per unit is then 1e14: beyond what is calculated with (audit/inliers/sanity.py)
-_MAX_RATIO: Final = 35.0  # as it is now; the aim is 8
+_MAX_RATIO: Final = 8.0
+_MAX_RATIO_QUICK: Final = 10.0  # what does not grow with the file counts in a file of 21 MB
 _SAME: Final = 1e-5  # relative, of lengths in px
 _FOCAL_PX: Final = 800.0
 _CENTRE_PX: Final = 500.0
@@ -124,19 +126,19 @@ def _moved(model: Any, scale: float, shift: float) -> Any:
 def points(folder: Path, quick: bool) -> Measured:
     """One image with a million points, and a second one that sees them: memory beside the file."""
     num = 200_000 if quick else 1_000_000
-    _write_views(folder, num_groups=1, num_points=num, track_length=2)
+    _written(folder, num_groups=1, num_points=num, track_length=2)
     size = _size(folder)
     before = _peak()
     _audit(folder)
-    ratio = (_peak() - before) / size
+    ratio, most = (_peak() - before) / size, _MAX_RATIO_QUICK if quick else _MAX_RATIO
     text = f"{num} points in each of 2 images, {size >> 20} MB: {ratio:.1f} times the file in memory"
-    return Measured(text, f"{_MAX_RATIO:g} times" * (ratio > _MAX_RATIO))
+    return Measured(text, f"{most:g} times" * (ratio > most))
 
 
 def images(folder: Path, quick: bool) -> Measured:
     """A hundred thousand images with 5 points: what an image costs that cannot be tested."""
     num = 2_000 if quick else 100_000
-    _write_views(folder, num_groups=num // 5, num_points=5, track_length=5)
+    _written(folder, num_groups=num // 5, num_points=5, track_length=5)
     _audit(writer.write_binary(folder / "warm", writer.noisy_model()))
     start, before = time.process_time(), _peak()
     audit = _audit(folder)
@@ -172,6 +174,12 @@ def models(folder: Path, quick: bool) -> Measured:
     grown = (_resident() - early) / 2**20
     text = f"{num} models one after the other: {grown:+.1f} MB from a quarter of them to the end"
     return Measured(text, "8 MB" * (grown > 8.0))
+
+
+def _written(folder: Path, **sizes: int) -> None:
+    """Write in a process of its own, whose memory is not that of the audit."""
+    with ProcessPoolExecutor(1) as pool:
+        pool.submit(_write_views, folder, **sizes).result()
 
 
 def _write_views(folder: Path, *, num_groups: int, num_points: int, track_length: int) -> None:

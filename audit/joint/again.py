@@ -117,7 +117,7 @@ def _next(system: JointSystem, model: SparseModel, residuals: ModelResiduals) ->
     left = observations.residuals_px()
     padded = np.append(step, 0.0)
     for image in observations.used_images:
-        left[observations.rows(image)] -= observations.nuisance(image) @ padded[layout.columns[image]]
+        observations.subtract_step(left, image, padded[layout.columns[image]])
     moved = point_steps(observations, observations.weight, reduced.point_inverse, left)
     return _State(model, residuals, observations, np.asarray(step), moved)
 

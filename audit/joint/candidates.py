@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from sfm_audit.audit.joint.design import AT_ONCE, PART
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
-from sfm_audit.audit.joint.observations import JointObservations, design_crossed, design_scores
+from sfm_audit.audit.joint.observations import design_crossed, design_scores
 from sfm_audit.audit.joint.system import Base, IncludedFields
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
@@ -20,7 +20,8 @@ class CandidateScores:
     """c candidate fields, projected off the base: sums that need nobody beyond who shares their tracks.
 
     sq_length: (c,) |E|^2 before the projection.    gram: (c, c) K.    score: (c,) u.
-    track_score: (T, c) G of the T tracks that the images see.
+    track_score: (T, c) G of the T tracks that the images see; of large images (c, c) with the same G^T G.
+    num_tracks: T.
     coupling: (s, c) R at the columns ``support`` (s,) of the base.    solution: (s, c) B = S^+ R there.
     num_observations: of the images.
     """
@@ -29,6 +30,7 @@ class CandidateScores:
     gram: FloatArray
     score: FloatArray
     track_score: FloatArray
+    num_tracks: int
     coupling: FloatArray
     support: IntArray
     solution: FloatArray
@@ -45,10 +47,6 @@ class CandidateScores:
             coupling=self.coupling[:, columns],
             solution=self.solution[:, columns],
         )
-
-
-AT_ONCE: Final = 2**15
-"""Observations of an image, or points, whose fields are in memory at the same time."""
 
 
 class ImageFields(NamedTuple):
@@ -84,37 +82,42 @@ def candidate_scores(
     R = N^T E - W V^-1 J^T E,  B = S^+ R,  K = E^T E - (J^T E)^T V^-1 (J^T E) - R^T B,  u = E^T y~,
     G_t = sum over own views of E^T y~ - sum over all views k of the track of B_k^T N_k^T y~_k.
 
-    Fields of 32,768 points at once: a single image with more goes through all of it in parts, of several images only
-    their own sums do. Sums are in the order of points, whatever the machine.
+    Where an image has more than 32,768 observations everything is gone through in parts, and what the tracks add up to
+    comes in a second round. Sums are in the order of points, whatever the machine.
     """
     observations = base.observations
     points = _points_of(base, images)
-    parts = _parts(points.size) if len(images) == 1 else [slice(0, points.size)]
-    chunks = [chunk for part in parts for chunk in _chunks(observations, points, part)]
-    coupling = _Coupling(base, [around.images for _, _, around in chunks])
-    sums = _OwnSums(base, points, coupling)
-    view_scores: list[FloatArray | None] = []
+    in_parts = any(observations.num_of(image) > AT_ONCE for image in images)
+    parts = _parts(points.size) if in_parts else [slice(0, points.size)]
+    around = _Surroundings(base, points, parts)
+    coupling = _Coupling(base, around.images())
+    sums = _OwnSums(base, points, coupling, images, fields_of)
+    kept_scores: FloatArray | None = None
     for part in parts:
-        absorbed = sums.add(part, images, fields_of, in_parts=len(parts) > 1)
-        for within, own, around in chunks:
-            if within is part and not observations.points_independent:
-                keep = len(chunks) == 1
-                view_scores.append(coupling.subtract_tracks(sums.right, around, absorbed[own], keep=keep))
-    right, gram, track_score = sums.right, sums.gram, sums.track_score
-    sq_length, count = gram.diagonal().copy(), len(gram)
+        absorbed = sums.add(part, in_parts=in_parts)
+        for own, near in around.of(part) if not observations.points_independent else ():
+            kept_scores = coupling.subtract_tracks(sums.right, near, absorbed[own], keep=around.is_one)
+    right, gram, sq_length = sums.right, sums.gram, sums.gram.diagonal().copy()
     for gone in sums.eliminated:
         gram -= gone
     solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
-    score = track_score.sum(axis=0)
-    padded = np.vstack([solution, np.zeros((1, count))])
-    for (part, own, around), known in zip_longest(chunks, view_scores):
-        track_score[part][own] -= coupling.scores(around, padded, known)
+    padded = np.vstack([solution, np.zeros((1, len(gram)))])
+    track_score = np.zeros((0, len(gram)))
+    for part in parts:
+        own_score = sums.track_scores(part) if in_parts else sums.track_score
+        coupling.subtract_scores(own_score, around.of(part), padded, kept_scores)
+        track_score = _joined(track_score, own_score) if in_parts else own_score
     num_observations = sum(observations.num_of(image) for image in images)
-    gram = 0.5 * (gram + gram.T)
-    return CandidateScores(
-        sq_length, gram, score, track_score, right[:-1], coupling.support, solution, num_observations
-    )
+    of_fields = sq_length, 0.5 * (gram + gram.T), sums.score, track_score, points.size
+    return CandidateScores(*of_fields, right[:-1], coupling.support, solution, num_observations)
+
+
+def _joined(root: FloatArray, track_score: FloatArray) -> FloatArray:
+    """(c, c) R with R^T R the sum of both G^T G; columns that are not finite are zero: their K is not finite either."""
+    rows = np.concatenate([root, track_score])
+    rows[:, ~np.isfinite(rows).all(axis=0)] = 0.0
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _points_of(base: Base, images: Sequence[int]) -> IntArray:
@@ -129,56 +132,86 @@ def _points_of(base: Base, images: Sequence[int]) -> IntArray:
 
 
 def _parts(size: int) -> list[slice]:
-    return [slice(start, min(start + AT_ONCE, size)) for start in range(0, size, AT_ONCE)]
+    return [slice(start, min(start + PART, size)) for start in range(0, size, PART)]
 
 
-def _chunks(
-    observations: JointObservations, points: IntArray, part: slice
-) -> Iterator[tuple[slice, slice, Neighbourhood]]:
-    """A part of the points, which of them, and who sees these."""
-    for own in point_chunks(observations, points[part]):
-        yield part, own, neighbourhood(observations, points[part][own])
+class _Surroundings:
+    """Who sees the points of a part: kept where there is one part, collected again where there are several."""
+
+    def __init__(self, base: Base, points: IntArray, parts: list[slice]) -> None:
+        self._observations, self._points, self._parts = base.observations, points, parts
+        self._kept = list(self._collected(parts[0])) if len(parts) == 1 else None
+        self.is_one = self._kept is not None and len(self._kept) == 1
+
+    def _collected(self, part: slice) -> Iterator[tuple[slice, Neighbourhood]]:
+        points = self._points[part]
+        for own in point_chunks(self._observations, points):
+            yield own, neighbourhood(self._observations, points[own])
+
+    def of(self, part: slice) -> Iterable[tuple[slice, Neighbourhood]]:
+        """Which of the part's points, and who sees these."""
+        return self._collected(part) if self._kept is None else self._kept
+
+    def images(self) -> list[IntArray]:
+        """Images around."""
+        return [near.images for part in self._parts for _, near in self.of(part)]
 
 
 class _OwnSums:
-    """What the images' own observations add up to, image by image.
+    """What the images' own observations add up to, part by part of their points.
 
-    gram: (c, c) E^T E.    track_score: (T, c) E^T y~.    right: (s + 1, c) N^T E.
-    eliminated: (c, c) (J^T E)^T V^-1 (J^T E) of each part of the points.
+    gram: (c, c) E^T E.    score: (c,) E^T y~.    track_score: (T, c) the same of each track, of the last part.
+    right: (s + 1, c) N^T E.    eliminated: (c, c) (J^T E)^T V^-1 (J^T E) of each part.
     """
 
-    def __init__(self, base: Base, points: IntArray, coupling: _Coupling) -> None:
-        self._base, self._points, self._coupling = base, points, coupling
-        self.gram = self.right = self.track_score = np.zeros((0, 0))
-        self.eliminated: list[FloatArray] = []
-
-    def add(
+    def __init__(
         self,
-        part: slice,
+        base: Base,
+        points: IntArray,
+        coupling: _Coupling,
         images: Sequence[int],
         fields_of: Callable[[int], ImageFields | FieldsInParts],
-        *,
-        in_parts: bool,
-    ) -> FloatArray:
+    ) -> None:
+        self._base, self._points, self._coupling = base, points, coupling
+        self._images, self._fields_of = images, fields_of
+        self.gram = self.right = self.score = self.track_score = np.zeros((0, 0))
+        self.eliminated: list[FloatArray] = []
+
+    def add(self, part: slice, *, in_parts: bool) -> FloatArray:
         """Add what the images see of a part of the points; return (T, 3, c) V^-1 J^T E of these points."""
+        observations = self._base.observations
         crossed = np.zeros((0, 0, 0))
-        for image in images:
-            fields = fields_of(image)
-            for chosen in self._chosen(image, part) if in_parts else _parts(self._base.observations.num_of(image)):
+        for image in self._images:
+            fields = self._fields_of(image)
+            for chosen in self._chosen(image, part) if in_parts else _slices(observations.num_of(image)):
                 own = fields.part(chosen)
                 if not crossed.size:
-                    crossed = np.zeros((part.stop - part.start, 3, own.fields.shape[2]))
+                    count = own.fields.shape[2]
+                    crossed = np.zeros((part.stop - part.start, 3, count))
+                    self.track_score = np.zeros((part.stop - part.start, count))
                 self._add(image, own, chosen, part, crossed)
+        self.score = self.track_score.sum(axis=0) + (self.score if self.score.size else 0.0)
         absorbed = self._base.point_inverse[self._points[part]] @ crossed
         count = crossed.shape[2]
         self.eliminated.append(crossed.reshape(-1, count).T @ absorbed.reshape(-1, count))
         return np.asarray(absorbed)
 
+    def track_scores(self, part: slice) -> FloatArray:
+        """(T, c) E^T y~ of each track of a part of the points, once more."""
+        self.track_score = np.zeros((part.stop - part.start, len(self.gram)))
+        for image in self._images:
+            fields = self._fields_of(image)
+            for chosen in self._chosen(image, part):
+                weight = self._base.observations.weight[self._base.observations.rows(image)][chosen, None, None]
+                self._add_scores(image, fields.part(chosen).fields * weight, chosen, part)
+        return self.track_score
+
     def _chosen(self, image: int, part: slice) -> list[IntArray]:
         """Observations of an image that show a part of the points."""
         point_idx = self._base.observations.point_idx[self._base.observations.rows(image)]
         first, last = self._points[part.start], self._points[part.stop - 1]
-        return [np.flatnonzero((point_idx >= first) & (point_idx <= last))]
+        found = np.flatnonzero((point_idx >= first) & (point_idx <= last))
+        return [found] if found.size else []
 
     def _add(self, image: int, own: ImageFields, chosen: slice | IntArray, part: slice, crossed: FloatArray) -> None:
         observations = self._base.observations
@@ -187,15 +220,27 @@ class _OwnSums:
         flat = weighted.reshape(-1, count)
         if not self.gram.size:
             self.gram, self.right = np.zeros((count, count)), self._coupling.zeros(count)
-            self.track_score = np.zeros((self._points.size, count))
-        seen, track = np.unique(observations.point_idx[rows][chosen], return_inverse=True)
-        at = np.searchsorted(self._points[part], seen)
-        own_crossed = observations.jacobian(image)[chosen].transpose(0, 2, 1) @ weighted
-        crossed[at] += sum_by_track(own_crossed, track, seen.size)
-        track_score = np.einsum("nac,na->nc", weighted, self._base.left_px[rows][chosen])
-        self.track_score[part][at] += sum_by_track(track_score, track, seen.size)
+        own_crossed = observations.jacobian(image, chosen).transpose(0, 2, 1) @ weighted
+        at, track = self._add_scores(image, weighted, chosen, part)
+        crossed[at] += sum_by_track(own_crossed, track, at.size)
         self.gram += flat.T @ own.fields.reshape(-1, count)
         self._coupling.add_own(self.right, image, own.nuisance, flat, chosen)
+
+    def _add_scores(
+        self, image: int, weighted: FloatArray, chosen: slice | IntArray, part: slice
+    ) -> tuple[IntArray, IntArray]:
+        """Add E^T y~; return which of the part's points the observations show (t,), and of which each is (n,)."""
+        observations = self._base.observations
+        rows = observations.rows(image)
+        seen, track = np.unique(observations.point_idx[rows][chosen], return_inverse=True)
+        at = np.searchsorted(self._points[part], seen)
+        track_score = np.einsum("nac,na->nc", weighted, self._base.left_px[rows][chosen])
+        self.track_score[at] += sum_by_track(track_score, track, seen.size)
+        return at, track
+
+
+def _slices(size: int) -> list[slice]:
+    return [slice(start, min(start + AT_ONCE, size)) for start in range(0, size, AT_ONCE)]
 
 
 class _Coupling:
@@ -253,6 +298,17 @@ class _Coupling:
             crossed = extra.crossed[within].transpose(1, 0, 2).reshape(extra.columns.size, -1)
             right[self._place[extra.columns]] -= crossed @ seen
         return design_scores(design, weight, self._base.left_px[around.views]) if keep else None
+
+    def subtract_scores(
+        self,
+        track_score: FloatArray,
+        around: Iterable[tuple[slice, Neighbourhood]],
+        solution: FloatArray,
+        known: FloatArray | None,
+    ) -> None:
+        """Subtract `scores` from those of the tracks (T, c), in place."""
+        for own, near in around:
+            track_score[own] -= self.scores(near, solution, known)
 
     def scores(self, around: Neighbourhood, solution: FloatArray, known: FloatArray | None) -> FloatArray:
         """(T, c) sum over the views of each track of B_k^T h_k; ``solution`` (s + 1, c) is B and a row of zeros.

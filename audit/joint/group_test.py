@@ -59,7 +59,7 @@ def test_group(
     rank, n = len(root), scores.num_observations
     if rank == 0:
         return untested(MisfitStatus.ABSORBED, 0)
-    clusters = min(len(scores.track_score), n)
+    clusters = min(scores.num_tracks, n)
     if min(n, clusters) < MIN_OBSERVATIONS_PER_RANK * rank:
         return untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank)
     z = root @ scores.score[own]

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from sfm_audit.audit.joint.candidates import CandidateScores, ImageFields, candidate_scores
+from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE
 from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
-from sfm_audit.loaders.arrays import FloatArray, distinct
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """Fields of one image that are to be free."""
+    """Fields of one image that are to be free.
+
+    fields: (n_i, 2, r) px per unit.    nuisance: gives (n, 2, C) px per unit, nuisance columns of chosen observations.
+    """
 
     image_idx: int
-    image: ImageFields
+    fields: FloatArray
+    nuisance: Callable[[slice | IntArray], FloatArray]
 
-    @property
-    def fields(self) -> FloatArray:
-        """(n_i, 2, r) px per unit."""
-        return self.image.fields
+    def part(self, chosen: slice | IntArray) -> ImageFields:
+        """Return fields and nuisance columns of some of the observations."""
+        return ImageFields(self.fields[chosen], self.nuisance(chosen))
 
 
 def include(base: Base, candidates: list[Candidate]) -> Base:
@@ -34,7 +38,7 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = K^+ u with K of all new fields together (those of two images meet in shared points), step -> step - B
     theta, and the inverse gets a border. Directions of K with unit columns below 1e-4 stay out, as in the test.
     """
-    by_image = {c.image_idx: c.image for c in candidates}
+    by_image = {c.image_idx: FieldsInParts(c.part) for c in candidates}
     scores = [candidate_scores(base, [c.image_idx], by_image.__getitem__) for c in candidates]
     starts = np.cumsum([0, *(c.fields.shape[2] for c in candidates)])
     size = base.inverse.size

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 
 from sfm_audit.audit.inliers.projected import ProjectedImage
-from sfm_audit.audit.joint.candidates import AT_ONCE, CandidateScores, FieldsInParts, ImageFields, candidate_scores
+from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
+from sfm_audit.audit.joint.design import AT_ONCE, EVERY
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
 from sfm_audit.audit.joint.inclusion import Candidate, include
-from sfm_audit.audit.joint.observations import EVERY
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
@@ -202,8 +202,10 @@ class _Rounds:
             if scores is not None:
                 own = GROUP_COLUMNS[group]
                 root = group_root(scores, own)
-                fields = _fields_of(self._system, image)
-                candidates.append(Candidate(image, ImageFields(fields.fields[:, :, own] @ root.T, fields.nuisance)))
+                observations = self._system.observations
+                parts = (_fields_of(self._system, image, chosen=part).fields for part in observations.parts(image))
+                fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
+                candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
 
     def _touched(self, new: BoolArray) -> BoolArray:

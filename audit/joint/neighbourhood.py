@@ -9,10 +9,12 @@ from typing import Final
 import numpy as np
 from scipy import sparse
 
+from sfm_audit.audit.joint.design import AT_ONCE
 from sfm_audit.audit.joint.observations import JointObservations
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _VIEWS_AT_ONCE: Final = 200_000
+_VIEWS_OF_LARGE: Final = 2**15  # of points of an image so large that it is gone through in parts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +113,7 @@ def neighbourhood(observations: JointObservations, points: IntArray) -> Neighbou
 def point_chunks(observations: JointObservations, points: IntArray) -> Iterator[slice]:
     """Ranges of ``points`` with a bounded number of views each."""
     counts = observations.point_offsets[points + 1] - observations.point_offsets[points]
-    chunk = np.cumsum(counts) // _VIEWS_AT_ONCE
+    chunk = np.cumsum(counts) // (_VIEWS_OF_LARGE if points.size > AT_ONCE else _VIEWS_AT_ONCE)
     bounds = np.concatenate([np.flatnonzero(np.diff(chunk, prepend=-1)), [points.size]])
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         yield slice(start, stop)

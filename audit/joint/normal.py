@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
-from sfm_audit.audit.joint.neighbourhood import neighbourhood, sum_by_track
+from sfm_audit.audit.joint.design import AT_ONCE
+from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
@@ -37,13 +39,15 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
     blocks = _Blocks(layout.num_columns), _Blocks(layout.num_columns)
     for image in observations.used_images:
         rows, columns = observations.rows(image), layout.columns[image]
-        own = observations.nuisance(image)
-        for k, weight in enumerate(weights):
-            weighted = (own * weight[rows, None, None]).reshape(-1, layout.width)
-            gram = weighted.T @ own.reshape(-1, layout.width)
-            np.add.at(right[k], columns, cleaned[k][rows].reshape(-1) @ weighted)
-            np.add.at(before[k], columns, gram.diagonal())
-            blocks[k].add(columns, columns[None], 0.5 * gram[None])
+        for part in observations.parts(image):
+            own = observations.nuisance(image, part)
+            for k, weight in enumerate(weights):
+                weighted = (own * weight[rows][part, None, None]).reshape(-1, layout.width)
+                gram = weighted.T @ own.reshape(-1, layout.width)
+                np.add.at(right[k], columns, cleaned[k][rows][part].reshape(-1) @ weighted)
+                np.add.at(before[k], columns, gram.diagonal())
+                blocks[k].add(columns, columns[None], 0.5 * gram[None])
+    del cleaned, values_px
     if not observations.points_independent:
         _eliminate_points(observations, inverses, blocks)
     robust, plain = (
@@ -58,20 +62,26 @@ def _eliminate_points(
     """Subtract half of sum W V^-1 W^T, image by image: each pair of images that share points once."""
     layout, transform = observations.layout, observations.transform
     to_plain = observations.plain_weight / observations.weight
-    for image in observations.used_images:
-        points = distinct(observations.point_idx[observations.rows(image)])
-        around = neighbourhood(observations, points).from_image(image)
+    for image, around in _neighbourhoods(observations):
         track = around.track[: around.starts[1]]  # its own views come first
         crossed = design_crossed(*observations.weighted(around.views))
         columns, others = layout.columns[image], layout.columns[around.images]
         for k, inverse in enumerate(inverses):
             if k == 1:
                 crossed *= to_plain[around.views, None, None]
-            own = sum_by_track(crossed[: len(track)] @ transform[image], track, points.size)
-            eliminated = inverse[points] @ own  # V^-1 W^T
+            own = sum_by_track(crossed[: len(track)] @ transform[image], track, around.points.size)
+            eliminated = inverse[around.points] @ own  # V^-1 W^T
             slab = transform[around.images].transpose(0, 2, 1) @ around.gather(crossed, eliminated)
             slab[0] *= 0.5
             blocks[k].add(columns, others, -slab.transpose(0, 2, 1))
+
+
+def _neighbourhoods(observations: JointObservations) -> Iterator[tuple[int, Neighbourhood]]:
+    """Each image with the views of its points, its own and those of images behind it; a bounded number at a time."""
+    for image in observations.used_images:
+        points = distinct(observations.point_idx[observations.rows(image)])
+        for chunk in point_chunks(observations, points):
+            yield image, neighbourhood(observations, points[chunk]).from_image(image)
 
 
 def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.csr_array:
@@ -83,12 +93,10 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
     """
     layout, transform = observations.layout, observations.transform
     blocks = _Blocks(layout.num_columns)
-    for image in observations.used_images:
-        points = distinct(observations.point_idx[observations.rows(image)])
-        around = neighbourhood(observations, points).from_image(image)
+    for image, around in _neighbourhoods(observations):
         track = around.track[: around.starts[1]]
         score = observations.scores(around.views, left_px)
-        own = sum_by_track(score[: len(track)] @ transform[image], track, points.size)
+        own = sum_by_track(score[: len(track)] @ transform[image], track, around.points.size)
         slab = transform[around.images].transpose(0, 2, 1) @ around.gather(score[:, None, :], own[:, None, :])
         slab[0] *= 0.5
         blocks.add(layout.columns[image], layout.columns[around.images], slab.transpose(0, 2, 1))
@@ -131,12 +139,14 @@ def _point_inverse(observations: JointObservations, weight: FloatArray) -> Float
     information = point_information(
         observations.residuals.point_jacobian, everywhere, observations.residuals.point_idx, observations.num_points
     )
+    del everywhere
     seen = np.flatnonzero(np.diff(observations.point_offsets) > 0)
-    scale = np.sqrt(np.einsum("pii->pi", information[seen]))
-    unit = information[seen] / scale[:, :, None] / scale[:, None, :]
-    out = np.zeros_like(information)
-    out[seen] = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
-    return out
+    for start in range(0, seen.size, AT_ONCE):  # in place: what nobody sees is zero, and stays so
+        part = seen[start : start + AT_ONCE]
+        scale = np.sqrt(np.einsum("pii->pi", information[part]))
+        unit = information[part] / scale[:, :, None] / scale[:, None, :]
+        information[part] = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
+    return information
 
 
 class _Blocks:

@@ -9,13 +9,12 @@ import numpy as np
 
 from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.joint.design import AT_ONCE, EVERY, PART, POINT, Design, make_design
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 MIN_INLIERS: Final = 20
-EVERY: Final = slice(None)
-_POINT: Final = slice(3, 6)  # columns of J in the design
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
 _SINGULAR_POINT: Final = 1e-9  # determinant of V with unit diagonal
 _MIN_VIEWS: Final = 2
@@ -28,7 +27,7 @@ class JointObservations:
     model, residuals: where they come from.
     offsets: (I + 1,) image i owns rows offsets[i]:offsets[i + 1].    source: (n,) columns of ModelResiduals.
     image_idx: (n,).    point_idx: (n,) rows of PointTable; of an independent point, the observation itself.
-    design: (n, 2, C) rotation columns of N, J in place of translation columns, own columns; zero in padding.
+    design: (n, 2, C) see `Design`.
     transform: (I, C, C) T of each image: N = design T. A translation in the camera's axes moves a pixel as one in the
     world's axes moves it, turned, so that nothing is stored twice.
     weight: (n,) w / s^2 with w = min(1, 2.5 s / |eps|), 1 / px^2.
@@ -44,7 +43,7 @@ class JointObservations:
     source: IntArray
     image_idx: IntArray
     point_idx: IntArray
-    design: FloatArray
+    design: Design
     transform: FloatArray
     weight: FloatArray
     sigma_px: FloatArray
@@ -75,17 +74,28 @@ class JointObservations:
         """(n, 2) observed minus projected."""
         return np.ascontiguousarray(self.residuals.residuals_px.take(self.source, axis=1).T)
 
-    def jacobian(self, image_idx: int) -> FloatArray:
-        """J (n_i, 2, 3) of an image, px per model unit, world frame."""
-        return self.design[self.rows(image_idx), :, _POINT]
+    def parts(self, image_idx: int) -> list[slice]:
+        """Observations of an image whose derivatives are in memory at the same time: all, or those of a part."""
+        num = self.num_of(image_idx)
+        return [slice(start, min(start + PART, num)) for start in range(0, num, PART)] if num > AT_ONCE else [EVERY]
+
+    def jacobian(self, image_idx: int, chosen: slice | IntArray = EVERY) -> FloatArray:
+        """J (n_i, 2, 3) of an image, or of some of its observations, px per model unit, world frame."""
+        return self.design.jacobian(image_idx, chosen)
 
     def nuisance(self, image_idx: int, chosen: slice | IntArray = EVERY) -> FloatArray:
         """N (n_i, 2, C) of an image, or of some of its observations, px per unit of its columns."""
-        return np.asarray(self.design[self.rows(image_idx)][chosen] @ self.transform[image_idx])
+        return np.asarray(self.design.of(image_idx, chosen) @ self.transform[image_idx])
+
+    def subtract_step(self, left_px: FloatArray, image_idx: int, step: FloatArray) -> None:
+        """Subtract N step of an image, ``step`` (C,), from its rows of ``left_px`` (n, 2), in place."""
+        own = left_px[self.rows(image_idx)]
+        for part in self.parts(image_idx):
+            own[part] -= self.nuisance(image_idx, part) @ step
 
     def weighted(self, views: IntArray | slice) -> tuple[FloatArray, FloatArray]:
         """Return (v, 2, C) the design of some observations, and (v,) their weights."""
-        return self.design[views], self.weight[views]
+        return self.design.at(views), self.weight[views]
 
     def scores(self, views: IntArray | slice, left_px: FloatArray) -> FloatArray:
         """(v, C) w design^T y~ of some observations; ``left_px`` (n, 2) is y~ of all."""
@@ -144,7 +154,7 @@ def joint_observations(
         source,
         image_idx,
         point_idx,
-        _design(model, residuals, layout, source, offsets),
+        make_design(model, residuals, layout, source, offsets),
         _transforms(model, layout),
         weight[source],
         sigma_px,
@@ -155,37 +165,18 @@ def joint_observations(
     )
 
 
-def _design(
-    model: SparseModel, residuals: ModelResiduals, layout: Layout, source: IntArray, offsets: IntArray
-) -> FloatArray:
-    """(n, 2, C), image by image."""
-    out = np.zeros((source.size, 2, layout.width))
-    for image in np.flatnonzero(np.diff(offsets)).tolist():
-        rows = slice(int(offsets[image]), int(offsets[image + 1]))
-        inliers = image_inliers(model, residuals, image, source[rows] - residuals.offsets[image])
-        projected, own = inliers.projected, out[rows]
-        own[:, :, : _POINT.start] = projected.pose[: _POINT.start].transpose(2, 1, 0)
-        own[:, :, _POINT] = residuals.point_jacobian.take(source[rows], axis=2).transpose(2, 0, 1)
-        params = list(layout.own_param_idxs[int(layout.camera_idx[image])])
-        if params:
-            own[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
-        else:  # at the poles of a panorama a column may not be finite: no effect there
-            own[~np.isfinite(own)] = 0.0
-    return out
-
-
 def _transforms(model: SparseModel, layout: Layout) -> FloatArray:
     """(I, C, C) T: d / d translation of the camera = J R^-1, then from the frame's pose to the image's."""
     out = np.tile(np.eye(layout.width), (len(model.images), 1, 1))
     for image in np.flatnonzero(layout.has_columns).tolist():
-        out[image, _POINT, _POINT] = np.linalg.pinv(model.image(image).rotation_cam_from_world)
+        out[image, POINT, POINT] = np.linalg.pinv(model.image(image).rotation_cam_from_world)
     out[:, :NUM_POSE, :NUM_POSE] = out[:, :NUM_POSE, :NUM_POSE] @ layout.image_from_frame
     return out
 
 
 def design_crossed(design: FloatArray, weight: FloatArray) -> FloatArray:
     """(v, 3, C) w J^T design of observations: times T what (6) sums to W^T."""
-    weighted = design[:, :, _POINT] * weight[:, None, None]
+    weighted = design[:, :, POINT] * weight[:, None, None]
     return np.asarray(np.matmul(weighted.transpose(0, 2, 1), design))
 
 

@@ -210,7 +210,7 @@ def with_step(base: Base, step: FloatArray) -> Base:
     layout, weight = observations.layout, observations.weight
     left = observations.residuals_px()
     for image in observations.used_images:
-        left[observations.rows(image)] -= observations.nuisance(image) @ padded[layout.columns[image]]
+        observations.subtract_step(left, image, padded[layout.columns[image]])
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
     moved = point_steps(observations, weight, base.point_inverse, left)

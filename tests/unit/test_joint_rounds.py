@@ -204,6 +204,7 @@ def scores(num_tracks=60, num=80, gram=None, seed=1):
         gram=gram,
         score=track_score.sum(axis=0) + 12.0,
         track_score=track_score,
+        num_tracks=num_tracks,
         coupling=np.zeros((0, 2)),
         support=np.zeros(0, int),
         solution=np.zeros((0, 2)),

@@ -125,7 +125,8 @@ def test_sandwich_is_clustered_by_track(system, reference, model):
 @pytest.mark.parametrize("images", [[2], [0, 2, 3]])
 def test_candidates_in_parts_are_those_of_all_points_at_once(system, images, monkeypatch):
     whole = candidate_scores(system.base, images, lambda image: fields_of(system, image))
-    monkeypatch.setattr(candidates, "AT_ONCE", 7)
+    monkeypatch.setattr(candidates, "AT_ONCE", 20)
+    monkeypatch.setattr(candidates, "PART", 7)
     asked = []
 
     def part(image, chosen):
@@ -134,8 +135,11 @@ def test_candidates_in_parts_are_those_of_all_points_at_once(system, images, mon
 
     parts = candidate_scores(system.base, images, lambda image: FieldsInParts(partial(part, image)))
     assert len(asked) > 3 * len(images)
-    for name in ("sq_length", "gram", "score", "track_score", "coupling"):
-        found, expected = getattr(parts, name), getattr(whole, name)
+    assert parts.num_tracks == whole.num_tracks == len(whole.track_score)
+    for name in ("sq_length", "gram", "score", "meat", "coupling"):
+        found, expected = (
+            each.track_score.T @ each.track_score if name == "meat" else getattr(each, name) for each in (parts, whole)
+        )
         assert_allclose(found, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max(), err_msg=name)
 
 
@@ -143,7 +147,8 @@ def test_a_large_image_is_tested_in_parts(system, monkeypatch):
     tau = np.full(len(system.model.images), 0.2)
     whole = joint_misfit(system, alpha=0.01, tau_px=tau)
     for module in (candidates, misfit):
-        monkeypatch.setattr(module, "AT_ONCE", 7)
+        monkeypatch.setattr(module, "AT_ONCE", 20)
+    monkeypatch.setattr(candidates, "PART", 7)
     parts = joint_misfit(system, alpha=0.01, tau_px=tau)
     for found, expected in zip(parts.tests, whole.tests, strict=True):
         assert [test.status for test in found.values()] == [test.status for test in expected.values()]
@@ -193,7 +198,7 @@ def test_inclusion_is_the_same_as_columns_more(system, reference):
             scores = candidate_scores(base, [image], lambda _, own=own: own)
             group = GROUP_COLUMNS[MisfitGroup.AFFINE if image != 3 else MisfitGroup.ROLLING_SHUTTER]
             root = group_root(scores, group)
-            candidates.append(Candidate(image, ImageFields(own.fields[:, :, group] @ root.T, own.nuisance)))
+            candidates.append(Candidate(image, own.fields[:, :, group] @ root.T, own.nuisance.__getitem__))
         base = include(base, candidates)
         extra = [placed(reference, c.image_idx, c.fields) for c in candidates]
         columns = np.hstack([columns, *extra])
@@ -217,7 +222,7 @@ def test_worth_is_how_far_inclusion_moves_the_image(system, model):
     scores = candidate_scores(system.base, [2], lambda _: own)
     root = group_root(scores, group)
     worth = worth_of(system, 2, scores, group, root)
-    base = include(system.base, [Candidate(2, ImageFields(own.fields[:, :, group] @ root.T, own.nuisance))])
+    base = include(system.base, [Candidate(2, own.fields[:, :, group] @ root.T, own.nuisance.__getitem__)])
     columns = system.observations.layout.columns[2]
     moved = (base.step[: len(system.base.step)] - system.base.step)[columns]
     image = model.image(2)
