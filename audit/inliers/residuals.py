@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
 from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
-from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_sane, is_usable
+from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_differentiable, is_sane, is_usable
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel
@@ -106,7 +106,7 @@ def image_residuals(
             xyz_cam = xyz_cam if all_in else xyz_cam[rows]
             residuals, jacobian, d_extra = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
         valid = (np.abs(residuals) <= MAX_RESIDUAL_PX).all(axis=0)
-        valid &= is_sane(jacobian).all(axis=(0, 1)) | ~np.isfinite(jacobian).all(axis=(0, 1))  # poles of panoramas stay
+        valid &= is_differentiable(jacobian, xyz_cam) | ~np.isfinite(jacobian).all(axis=(0, 1))  # poles of panoramas
     num_unprojected = valid.size - int(np.count_nonzero(valid))
     if num_unprojected:
         rows, xyz_cam = rows[valid], xyz_cam[valid]

@@ -13,7 +13,8 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray
 from sfm_audit.loaders.model import CameraRecord
 
 MAX_MAGNITUDE: Final = 1e12
-"""Of a coordinate, a parameter or a derivative: squares, and products of several, stay finite."""
+"""Of a coordinate or a parameter, and of a derivative in units of the image's depth: squares, products stay finite."""
+_MAX_DERIVATIVE: Final = 1e30  # in the model's unit, whatever that is
 MAX_RESIDUAL_PX: Final = 1e9
 _MIN_FOCAL_PX: Final = 1e-6
 
@@ -21,6 +22,18 @@ _MIN_FOCAL_PX: Final = 1e-6
 def is_sane(values: FloatArray) -> BoolArray:
     """Whether values are finite and at most 1e12 in magnitude; NaN is not."""
     return np.asarray(np.abs(values) <= MAX_MAGNITUDE)
+
+
+def is_differentiable(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> BoolArray:
+    """Whether derivatives (2, 3, n) px per unit at points (n, 3) in the camera frame can be calculated with, (n,).
+
+    They are compared in units of the median distance of the points, so that the unit of the model changes nothing.
+    """
+    if not len(xyz_cam):
+        return np.ones(0, dtype=np.bool_)
+    distance = float(np.median(np.abs(xyz_cam).max(axis=1)))
+    largest = np.abs(jacobian_cam).max(axis=(0, 1))
+    return np.asarray((largest * distance <= MAX_MAGNITUDE) & (largest <= _MAX_DERIVATIVE))
 
 
 def is_usable(camera: CameraRecord) -> bool:

@@ -295,7 +295,9 @@ class _Coupling:
             np.subtract.at(right, places, shared)
         for extra, own, within in self._included_near(around):
             seen = absorbed[around.track[own]].reshape(-1, absorbed.shape[2])
-            crossed = extra.crossed[within].transpose(1, 0, 2).reshape(extra.columns.size, -1)
+            weighted = extra.fields[within] * observations.weight[around.views[own], None, None]
+            crossed = weighted.transpose(0, 2, 1) @ observations.jacobian(extra.image_idx, within)  # w E^T J
+            crossed = crossed.transpose(1, 0, 2).reshape(extra.columns.size, -1)
             right[self._place[extra.columns]] -= crossed @ seen
         return design_scores(design, weight, self._base.left_px[around.views]) if keep else None
 

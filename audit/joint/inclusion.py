@@ -50,13 +50,9 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = root @ (root.T @ np.concatenate([own.score for own in scores]))
     step = np.concatenate([base.step - solution @ theta, theta])
     included = dict(base.included)
-    observations = base.observations
     for k, candidate in enumerate(candidates):
-        rows = observations.rows(candidate.image_idx)
-        weighted = candidate.fields * observations.weight[rows, None, None]
-        crossed = weighted.transpose(0, 2, 1) @ observations.jacobian(candidate.image_idx)
         columns = size + np.arange(starts[k], starts[k + 1])
-        included[candidate.image_idx] = IncludedFields(candidate.image_idx, candidate.fields, crossed, columns)
+        included[candidate.image_idx] = IncludedFields(candidate.image_idx, candidate.fields, columns)
     grown = replace(base, inverse=base.inverse.bordered(solution, root), included=included)
     return with_step(grown, step)
 
@@ -69,6 +65,8 @@ def _joint_gram(
     solution: FloatArray,
 ) -> FloatArray:
     """K (k, k) of all new fields: - (J^T E)^T V^-1 (J^T E) - R^T B between images, the tests' own K within."""
+    if len(candidates) == 1:
+        return 0.5 * (scores[0].gram + scores[0].gram.T)
     observations = base.observations
     total = int(starts[-1])
     coupled = np.zeros((base.inverse.size, total))

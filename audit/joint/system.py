@@ -30,12 +30,11 @@ _COLUMNS_AT_ONCE: Final = 400
 class IncludedFields:
     """Misfit fields of one image that are free parameters of the base.
 
-    fields: (n_i, 2, r) px.    crossed: (n_i, r, 3) w E^T J.    columns: (r,) of the inverse.
+    fields: (n_i, 2, r) px.    columns: (r,) of the inverse.
     """
 
     image_idx: int
     fields: FloatArray
-    crossed: FloatArray
     columns: IntArray
 
 

@@ -11,12 +11,17 @@ import numpy as np
 
 from sfm_audit.audit.cameras.functions import Term
 from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.misfit.capabilities import extended_params, larger_models, undistorted_model
+from sfm_audit.audit.misfit.fields import candidate_fields
+from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, image_tests_in_parts
 from sfm_audit.audit.misfit.multiplicity import holm
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
+from sfm_audit.audit.misfit.pooled import ImageDesign
 from sfm_audit.audit.misfit.score import prepare_image
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
@@ -108,9 +113,25 @@ def image_retest(xyz_cam: FloatArray, residuals_px: FloatArray) -> Retest:
     """
 
     def retest(camera: CameraRecord) -> MisfitTests:
+        if len(xyz_cam) > AT_ONCE:
+            return _test_in_parts(camera, xyz_cam, residuals_px)
         return prepare_image(camera, xyz_cam).test(residuals_px)
 
     return retest
+
+
+def _test_in_parts(camera: CameraRecord, xyz_cam: FloatArray, residuals_px: FloatArray) -> MisfitTests:
+    track = np.arange(len(xyz_cam))
+
+    def nuisance(chosen: IntArray) -> FloatArray:
+        return nuisance_columns(camera.model, project_image(camera, xyz_cam[chosen]))
+
+    def part(chosen: IntArray) -> ImageDesign:
+        projected = project_image(camera, xyz_cam[chosen])
+        columns, fields = nuisance_columns(camera.model, projected), candidate_fields(camera, projected)
+        return ImageDesign(columns, columns[:0], fields, residuals_px[:, chosen], track[chosen])
+
+    return image_tests_in_parts(PartedImage(track, nuisance, part), track.size)
 
 
 def _first_that_passes(

@@ -20,7 +20,16 @@ from sfm_audit.audit.engine import camera as engine_camera
 from sfm_audit.audit.engine import quality as engine_quality
 from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.audit.joint import candidates, design, misfit, neighbourhood, normal, observations
-from sfm_audit.audit.misfit import ImageDesign, MisfitGroup, MisfitStatus, camera_tests, in_parts, prepare
+from sfm_audit.audit.misfit import (
+    ImageDesign,
+    MisfitGroup,
+    MisfitStatus,
+    camera_tests,
+    cause,
+    image_retest,
+    in_parts,
+    prepare,
+)
 from sfm_audit.audit.misfit.in_parts import (
     PartedImage,
     camera_tests_in_parts,
@@ -120,7 +129,7 @@ def test_the_covariance_is_that_of_all_columns_at_once(where):
 
 @pytest.mark.parametrize("config", [AuditConfig(), AuditConfig(points="independent", noise="constant")])
 def test_a_model_of_large_images_gets_the_same_tables(tmp_path, monkeypatch, config):
-    model = open_model(write_binary(tmp_path, noisy_model(num_images=6, num_points=150)))
+    model = open_model(write_binary(tmp_path, noisy_model(num_images=4, num_points=90)))
     expected = audit_model(model, config)
     asked = []
     for module, name in ((engine_camera, "camera_tests_in_parts"), (engine_quality, "camera_quality_in_parts")):
@@ -133,7 +142,7 @@ def test_a_model_of_large_images_gets_the_same_tables(tmp_path, monkeypatch, con
     for module in (design, observations, candidates):
         monkeypatch.setattr(module, "PART", 30)
     found = audit_model(model, config)
-    assert len(asked) > 6
+    assert len(asked) > 4
     for table in ("images", "cameras", "models"):
         for row, other in zip(getattr(found, table).to_pylist(), getattr(expected, table).to_pylist(), strict=True):
             assert_same_row(row, other)
@@ -157,3 +166,13 @@ def assert_same(found, expected):
         assert (found[group].rank, found[group].status) == (test.rank, test.status), group
         if not math.isnan(test.p):
             assert_allclose([found[group].p, found[group].px], [test.p, test.px], rtol=1e-6, atol=1e-9, err_msg=group)
+
+
+@pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "OPENCV", "EQUIRECTANGULAR"])
+def test_a_larger_camera_is_tried_in_parts_as_at_once(monkeypatch, name):
+    rng = np.random.default_rng(6)
+    xyz_cam, y = points(rng, 300), rng.standard_normal((2, 300))
+    retest = image_retest(xyz_cam, y)
+    expected = retest(camera(name))
+    monkeypatch.setattr(cause, "AT_ONCE", 100)
+    assert_same(retest(camera(name)), expected)
