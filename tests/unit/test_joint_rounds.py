@@ -45,10 +45,12 @@ class Rounds:
                 image_idx=np.arange(num),
                 point_idx=np.zeros(num, int) if shares_points else np.arange(num),
                 num_of=lambda _: 100,
+                parts=lambda _: [slice(None)],
+                nuisance=lambda *_: None,
             ),
         )
         fields = SimpleNamespace(fields=np.zeros((1, 2, 42)), nuisance=None)
-        monkeypatch.setattr(joint_room, "_fields_of", lambda *_: fields)
+        monkeypatch.setattr(joint_room, "_fields_of", lambda *_, **__: fields)
         monkeypatch.setattr(joint_room, "candidate_scores", lambda *_: "scores")
         monkeypatch.setattr(joint_room, "group_root", lambda _, own: np.eye(own.stop - own.start) * own.start)
         monkeypatch.setattr(joint_room, "_image_tests", self._tests)
