@@ -5,13 +5,16 @@
 
 Everything on the page is from `sfm-audit run` (its tables) and `sfm-audit diagnose --json`, as anybody can call them.
 Without folders the corpus is looked for as the tests do: SFM_AUDIT_CORPUS, else ../shared/corpus; without a corpus
-the script says so and exits with 0. --work keeps the run folder and the JSON, and goes on from them. Exit code 1:
---quick found a median outside its band, or an image that is not accepted belongs to no diagnosis with an action.
+the script says so and exits with 0. --work keeps the run folder and a JSON file per model, and goes on from them.
+Models of more than 150 images are not refitted: adjusting one with four camera models can take half an hour. Exit
+code 1: --quick found a median outside its band; without it, an image that is not accepted belongs to no diagnosis with
+an action.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -21,12 +24,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import pandas as pd
+from tqdm import tqdm
+
 from scripts.corpus.models import CorpusModel, models_of
 from scripts.corpus.noise import check_bands
 from scripts.corpus.page import document, without_action
 from sfm_audit.audit.cli.errors import ExitCode
+from sfm_audit.audit.table.diagnoses import DiagnosisCode
 
 ROOT: Final = Path(__file__).resolve().parent.parent
+MAX_REFITTED: Final = 150  # images
 QUICK_MODELS: Final = (
     *("hsu_fox_bin", "halogen_sparse", "marychrisgo_dense", "softmurata"),
     *("yinsy_A", "own_south_building_sub_radial"),
@@ -43,13 +51,25 @@ def corpus_folders(given: Sequence[Path]) -> list[Path]:
 
 def audited(folders: Sequence[Path], work: Path, *, quick: bool) -> tuple[list[CorpusModel], list[str]]:
     """Run and diagnose the models below the folders; the second list says in one line each what cannot be read."""
-    run, diagnosis = work / "run", work / "diagnosis.json"
+    run = work / "run"
     scenes = [argument for scene in QUICK_MODELS for argument in ("--scene", scene)] if quick else []
     sfm_audit("run", *map(str, folders), *scenes, "-o", str(run), "--quiet")
-    if not quick and not diagnosis.exists():
-        sfm_audit("diagnose", str(run), "--refit", "--json", str(diagnosis))
-    diagnosed: list[dict[str, Any]] = json.loads(diagnosis.read_bytes())["models"] if diagnosis.exists() else []
-    return models_of(run, diagnosed)
+    return models_of(run, [] if quick else diagnosed(run, work / "diagnoses"))
+
+
+def diagnosed(run: Path, folder: Path) -> list[dict[str, Any]]:
+    """Diagnose every model that something speaks against, one file each; what is there already is not done again."""
+    folder.mkdir(exist_ok=True)
+    out: list[dict[str, Any]] = []
+    rows = pd.read_parquet(run / "models", columns=["model_path", "num_images", "diagnoses"]).to_dict("records")
+    for row in tqdm([row for row in rows if {each["code"] for each in row["diagnoses"]} - {DiagnosisCode.SOUND}]):
+        location = str(row["model_path"])
+        file = folder / f"{hashlib.sha256(location.encode()).hexdigest()[:16]}.json"
+        if not file.exists():
+            refit = "--refit" if row["num_images"] <= MAX_REFITTED else "--no-refit"
+            sfm_audit("diagnose", str(run), location, refit, "--json", str(file), "--quiet")
+        out += json.loads(file.read_bytes())["models"]
+    return out
 
 
 def sfm_audit(*arguments: str) -> None:
@@ -65,7 +85,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="*", help="COLMAP models or folders of them")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "docs" / "corpus.md")
-    parser.add_argument("--work", type=Path, help="keep the run folder and the diagnosis here")
+    parser.add_argument("--work", type=Path, help="keep the run folder and the diagnoses here")
     parser.add_argument("--quick", action="store_true", help="a few models against their bands; writes nothing")
     args = parser.parse_args()
     folders = corpus_folders(args.folders)

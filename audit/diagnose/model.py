@@ -66,12 +66,14 @@ def diagnose_model(
         said = ["Not read: where poses or parts do not hold, residuals tell nothing of a lens."]
     if not refitted:
         return ModelEvidence(numbers, said, (), (), "Not refitted.")
+    if not auditor.residuals.residuals_px.size:
+        return ModelEvidence(numbers, said, (), (), "Not refitted: no image has an observation to adjust.")
     if UNFIT & set(diagnoses):
         return ModelEvidence(numbers, said, (), (), "Not refitted: adjusting says nothing about such a model.")
     control = refit(auditor.model, None, auditor.config)
     tried = _refits(auditor, control, tables, wanted or advised(images, cameras), is_wanted=bool(wanted), out=out)
     lines = [refit_reading(tables, control, each) for each in (control, *tried)]
-    return ModelEvidence(numbers, said, (control, *tried), lines, conclusion(control, tried))
+    return ModelEvidence(numbers, said, (control, *tried), lines, conclusion(tables, control, tried))
 
 
 def _refits(

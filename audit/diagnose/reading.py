@@ -110,10 +110,15 @@ def helps(control: Refit, tried: Refit) -> bool:
     return before > 0 and after <= HELPS * before
 
 
-def conclusion(control: Refit, tried: Sequence[Refit]) -> str:
-    """Return what to do by the refits: the smallest camera model that helps, or that none does."""
+def conclusion(tables: Numbers, control: Refit, tried: Sequence[Refit]) -> str:
+    """Return what to do by the refits: the smallest camera model that helps, or that none does.
+
+    tables : of `summary_numbers` before
+    """
     if control.problem is not None:
         return f"It cannot be adjusted ({control.problem}); repair that first."
+    if not tried and tables["rejected_misfit"] == 0:
+        return f"Misfit rejects no image, so there is no lens to refit.{_adjusting(tables, control)}"
     if not tried and control.numbers["rejected_misfit"]:
         return "No larger camera model of the family can express these cameras; nothing was refitted but the control."
     if control.numbers["rejected_misfit"] == 0:
@@ -122,6 +127,14 @@ def conclusion(control: Refit, tried: Sequence[Refit]) -> str:
     if not helping:
         return "No refit helps: keep the camera model; what is left is not a lens of COLMAP's."
     return f"Refit as {helping[0].camera_model}."
+
+
+def _adjusting(before: Numbers, control: Refit) -> str:
+    """Say what adjusting changes of all rejections; nothing where it changes none for the better."""
+    was, rejected = before["rejected"], control.numbers["rejected"]
+    if rejected >= was:
+        return ""
+    return f" Adjusting the model as it is leaves {rejected:.0f} of {before['images']:.0f} rejected (was {was:.0f})."
 
 
 def _number(numbers: Numbers, name: str) -> float:

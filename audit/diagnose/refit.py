@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,7 @@ from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
 from sfm_audit.loaders import LoadError, SparseModel, open_model
 from sfm_audit.loaders.camera_models import BY_NAME
 
+_PLACE_IN_COLMAP: Final = re.compile(r"^\[[^\]]*\] ")
 LARGER: Final = ("RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are tried where nothing particular is advised, the smallest first."""
 
@@ -62,7 +64,8 @@ def refit(model: SparseModel, camera_model: str | None, config: AuditConfig, out
             _adjust(Path(before), folder)
             audited = audit_model(open_model(str(folder)), config)
         except (LoadError, ValueError, RuntimeError) as error:  # pycolmap refuses what cannot be adjusted
-            return Refit(camera_model, {}, " ".join(str(error).split())[:200])
+            said = _PLACE_IN_COLMAP.sub("", " ".join(str(error).split()))
+            return Refit(camera_model, {}, said[:200])
         return Refit(camera_model, summary_numbers(audited.images.to_pylist()))
 
 

@@ -98,6 +98,6 @@ def _interleaved(records: np.ndarray, elements: np.ndarray, offsets: IntArray) -
     owner = np.repeat(np.arange(len(records)), np.diff(offsets))
     element_starts = (owner + 1) * _POINT3D.itemsize + np.arange(len(elements)) * _TRACK_ELEMENT.itemsize
     out[element_starts[:, None] + np.arange(_TRACK_ELEMENT.itemsize)] = elements.view(np.uint8).reshape(
-        len(elements), -1
+        len(elements), _TRACK_ELEMENT.itemsize
     )
     return out.tobytes()

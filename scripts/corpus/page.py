@@ -41,10 +41,11 @@ with one image each, how often which cause is named of images that misfit reject
 ACTIONS_INTRO: Final = """\
 ## What is the matter, and what to do
 
-What `sfm-audit diagnose RUN --refit` says of every model that something speaks against: its diagnoses, the most urgent
+What `sfm-audit diagnose RUN` says of every model that something speaks against: its diagnoses, the most urgent
 first, with the images that each is about and what to do; what the residuals say beyond the tables; what bundle
 adjustment does, as the model is (the control) and with larger camera models (pycolmap, principal points fixed), audited
-again; and what follows. [diagnose.md](diagnose.md) explains how each sentence is found and what not to conclude."""
+again; and what follows. Models of more than 150 images are not refitted here. [diagnose.md](diagnose.md) explains how
+each sentence is found and what not to conclude."""
 EVIDENCE_INTRO: Final = """\
 ## The numbers behind it
 

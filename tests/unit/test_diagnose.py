@@ -1,5 +1,6 @@
 """Evidence and refits: what the sentences rest on, and that a refit finds what was taken away."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -72,12 +73,33 @@ def test_a_larger_camera_predicts_the_same(bent):
     assert candidates(bent, []) == ["RADIAL", "OPENCV", "FULL_OPENCV"]
 
 
+def test_a_model_that_nobody_sees_is_not_adjusted(bent):
+    blind = dataclasses.replace(
+        bent,
+        observations=dataclasses.replace(
+            bent.observations,
+            xy_px=bent.observations.xy_px[:0],
+            point2d_idx=bent.observations.point2d_idx[:0],
+            point_idx=bent.observations.point_idx[:0],
+            offsets=np.zeros_like(bent.observations.offsets),
+        ),
+    )
+    auditor = ModelAuditor(blind, AuditConfig())
+    tables = auditor.tables()
+    found = diagnose_model(auditor, tables.images.to_pylist(), tables.cameras.to_pylist(), ["too_little"])
+    assert (found.refits, found.conclusion) == ((), "Not refitted: no image has an observation to adjust.")
+
+
 def test_what_cannot_be_refitted_is_said(bent):
     assert refit(bent, "SIMPLE_PINHOLE", AuditConfig()).problem == "cannot express the present cameras"
 
 
 def done(name, rejected, images=10, smooth=0.1):
-    return Refit(name, {"rejected_misfit": rejected, "images": images, "smooth_px": smooth})
+    return Refit(name, {"rejected": rejected, "rejected_misfit": rejected, "images": images, "smooth_px": smooth})
+
+
+def before(rejected, misfit):
+    return {"rejected": rejected, "rejected_misfit": misfit, "images": 10}
 
 
 FAILED = Refit("OPENCV", {}, "it is odd")
@@ -93,11 +115,21 @@ def test_a_refit_helps_where_it_leaves_half_of_the_control():
 
 def test_the_smallest_model_that_helps_is_the_conclusion():
     control = done(None, 10)
-    assert conclusion(control, [done("RADIAL", 9), done("OPENCV", 1), done("FULL_OPENCV", 0)]) == "Refit as OPENCV."
-    assert conclusion(control, [done("RADIAL", 9), FAILED]).startswith("No refit helps")
-    assert conclusion(done(None, 0), [done("RADIAL", 0)]).startswith("Adjusting the model as it is")
-    assert conclusion(control, []).startswith("No larger camera model")
-    assert conclusion(FAILED, []) == "It cannot be adjusted (it is odd); repair that first."
+    tables, tried = before(10, 10), [done("RADIAL", 9), done("OPENCV", 1), done("FULL_OPENCV", 0)]
+    assert conclusion(tables, control, tried) == "Refit as OPENCV."
+    assert conclusion(tables, control, [done("RADIAL", 9), FAILED]).startswith("No refit helps")
+    assert conclusion(tables, done(None, 0), [done("RADIAL", 0)]).startswith("Adjusting the model as it is")
+    assert conclusion(tables, control, []).startswith("No larger camera model")
+    assert conclusion(tables, FAILED, []) == "It cannot be adjusted (it is odd); repair that first."
+
+
+def test_without_a_misfit_there_is_no_lens_to_refit():
+    nothing = "Misfit rejects no image, so there is no lens to refit."
+    assert conclusion(before(4, 0), done(None, 4), []) == nothing
+    assert (
+        conclusion(before(4, 0), done(None, 1), [])
+        == f"{nothing} Adjusting the model as it is leaves 1 of 10 rejected (was 4)."
+    )
 
 
 def test_refits_are_read_against_the_control():
