@@ -6,7 +6,7 @@ weights. Cameras on a line fix no turn about it: that direction is left out, and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,8 @@ MIN_POSITIONS: Final = 6
 NUM_PARAMETERS: Final = 7
 CHI2_3_MEDIAN: Final = 2.3659738843753377
 """Median of chi^2 with 3 degrees of freedom (scipy.stats.chi2.ppf(0.5, 3))."""
-_CUT: Final = 16.266236196238129  # its 99.9 % point: positions above it take no part in the fit
+CUT: Final = 16.266236196238129
+"""Its 99.9 % point: positions above it take no part in the fit."""
 _NUM_TRIPLES: Final = 300
 _NUM_STEPS: Final = 20
 _SINGULAR: Final = 1e-9
@@ -45,7 +46,7 @@ class PositionAlignment:
 
 
 def align_positions(
-    centre: FloatArray, position: FloatArray, covariance: FloatArray, *, min_spread: float = 1.0, seed: int = 0
+    centre: FloatArray, position: FloatArray, covariance: FloatArray, *, min_spread: float = 1.0, cut: float = CUT
 ) -> PositionAlignment | None:
     """Find the similarity that most positions follow.
 
@@ -54,7 +55,7 @@ def align_positions(
     centre : (n, 3) of the cameras, model units    position : (n, 3) measured    covariance : (n, 3, 3) of them
     min_spread : the least that positions are taken to scatter, in units of their covariances: 1 where these are said,
         0 where only their shares of each other are known
-    seed : of the triples
+    cut : squared distance in units of the spread above which a position takes no part in the fit
 
     Returns
     -------
@@ -73,30 +74,30 @@ def align_positions(
             weight: FloatArray = np.linalg.inv(covariance).astype(np.float64)
         except np.linalg.LinAlgError:
             return None
-        start = _least_median(centre, position, weight, np.random.default_rng(seed))
+        start = _least_median(centre, position, weight, np.random.default_rng(0))
         if start is None or not np.isfinite(weight).all():
             return None
-        similarity, fitted = start, _fitting(start, centre, position, weight, min_spread)
+        similarity, fitted = start, _fitting(start, centre, position, weight, (min_spread, cut))
         for _ in range(_NUM_STEPS):
             step = _step(similarity, centre[fitted], position[fitted], weight[fitted])
             if step is None:
                 return None
             similarity = _moved(similarity, step)
-            before, fitted = fitted, _fitting(similarity, centre, position, weight, min_spread)
+            before, fitted = fitted, _fitting(similarity, centre, position, weight, (min_spread, cut))
             if (fitted == before).all() and np.abs(step).max() < 1e-9:
                 break
         return _told(similarity, centre, position, covariance, fitted)
 
 
 def _fitting(
-    similarity: Similarity, centre: FloatArray, position: FloatArray, weight: FloatArray, min_spread: float
+    similarity: Similarity, centre: FloatArray, position: FloatArray, weight: FloatArray, limits: tuple[float, float]
 ) -> BoolArray:
-    """Which positions are near enough, in units of their own spread about the similarity."""
+    """Which positions are near enough, in units of their own spread; limits: its least value, and the cut."""
     chi2 = _chi2(position - similarity.points(centre), weight)
     degrees = 3 * len(centre)
     unit = float(np.median(chi2)) / CHI2_3_MEDIAN * degrees / (degrees - NUM_PARAMETERS)  # the fit took its share
-    unit = max(unit, min_spread**2, np.finfo(float).tiny)
-    fitting: BoolArray = chi2 <= _CUT * unit
+    unit = max(unit, limits[0] ** 2, np.finfo(float).tiny)
+    fitting: BoolArray = chi2 <= limits[1] * unit
     return fitting
 
 
@@ -202,11 +203,9 @@ def _told(
     return PositionAlignment(similarity, residual, chi2, whitened, spread, sd_scale, fitted)
 
 
-def rescaled(alignment: PositionAlignment, spread: float) -> PositionAlignment:
-    """Return the alignment if all covariances are ``spread``^2 times what was said."""
-    return replace(
-        alignment,
-        chi2=alignment.chi2 / spread**2,
-        whitened=alignment.whitened / spread,
-        sd_scale=alignment.sd_scale * spread,
-    )
+def common_covariance(alignment: PositionAlignment) -> tuple[FloatArray, float]:
+    """Return the covariance (3, 3) of the residuals in the fit, alike for all positions, and its degrees of freedom."""
+    residual = alignment.residual[alignment.fitted]
+    degrees = len(residual) - NUM_PARAMETERS / 3
+    covariance: FloatArray = residual.T @ residual / degrees
+    return covariance, degrees

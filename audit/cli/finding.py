@@ -106,25 +106,26 @@ def find_models(paths: Sequence[str], wanted: Wanted) -> Discovery:
     return found
 
 
-def refuse_lost_database(database: str | None) -> None:
-    """Refuse a database of this machine that is not there, once and not for every model.
+def refuse_lost(option: str, named: str | None, *, folder: str | None = None) -> None:
+    """Refuse what an option names on this machine and is not there, once and not for every model.
+
+    folder: what to do about a folder; None where it may be one.
 
     Raises
     ------
     KnownError
         There is no such file; one in an object store is asked when it is read.
     """
-    if database in {None, "auto"}:
+    if named in {None, "auto"}:
         return
     try:
-        path = parse_location(str(database))
+        path = parse_location(str(named))
     except LoadError as error:
-        raise KnownError(f"--database: {error}", ExitCode.USAGE) from error
+        raise KnownError(f"{option}: {error}", ExitCode.USAGE) from error
     if isinstance(path, Path) and not path.exists():
-        raise KnownError(f"--database {database}: there is no such file; check the path", ExitCode.UNREADABLE_INPUT)
-    if isinstance(path, Path) and path.is_dir():
-        problem = "is a folder; name the database.db in it, or auto"
-        raise KnownError(f"--database {database}: {problem}", ExitCode.UNREADABLE_INPUT)
+        raise KnownError(f"{option} {named}: there is no such file; check the path", ExitCode.UNREADABLE_INPUT)
+    if folder is not None and isinstance(path, Path) and path.is_dir():
+        raise KnownError(f"{option} {named}: is a folder; {folder}", ExitCode.UNREADABLE_INPUT)
 
 
 def listed(found: Discovery) -> tuple[list[str], list[str]]:

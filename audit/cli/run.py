@@ -14,7 +14,7 @@ from sfm_audit.audit.cli.finding import (
     CHOICE_OF_MODELS,
     find_models,
     listed,
-    refuse_lost_database,
+    refuse_lost,
     wanted_of,
     with_choice_of_models,
 )
@@ -129,7 +129,9 @@ def command(  # one parameter per option
     in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
     config = read_config(config_file, {name: options[name] for name in _SETTINGS})
-    refuse_lost_database(config.database)
+    refuse_lost("--database", config.database, folder="name the database.db in it, or auto")
+    refuse_lost("--reference", config.reference)
+    refuse_lost("--priors", config.priors, folder="name the CSV or database in it, or auto")
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
     if options["only_list"] and options["as_json"]:
         raise click.UsageError("--list and --json exclude each other; --list is a table with tabs.")

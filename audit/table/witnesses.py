@@ -61,7 +61,12 @@ WITNESSES: Final[dict[Witness, WitnessWords]] = {
         num_healthy=205,  # scripts/study_pairs.py
     ),
     Witness.FOLD: WitnessWords("is a point seen by all images that should see it?", "nothing but the model"),
-    Witness.REFERENCE: WitnessWords("is the pose where a reference has it?", "poses of a reference (--reference)"),
+    Witness.REFERENCE: WitnessWords(
+        "is the pose where a reference has it?",
+        "poses of a reference (--reference)",
+        num_false_alarms=1,
+        num_healthy=196,  # scripts/study_references.py
+    ),
     Witness.PRIORS: WitnessWords("is the centre where its prior has it?", "position priors (--priors)"),
 }
 """The one list of witnesses, with what was measured of each."""

@@ -2,26 +2,33 @@
 
 H0: prior = similarity (centre) + error, errors of the given covariances and independent: the squared distance in their
 units is chi^2 with 3 degrees of freedom, the share of the fitted similarity taken into account. Priors that scatter
-more than they say are judged by their scatter (a robust estimate), those without a covariance by that alone.
+more than they say are judged by their scatter (its median), those without a covariance by one estimated for all.
 Blind to what the similarity takes up (global scale, place, turn), and to what is within a few sd of the sensor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 
 from sfm_audit.audit.alignment import Poses, natural_order, usable_poses
-from sfm_audit.audit.alignment.positions import MIN_POSITIONS, PositionAlignment, align_positions, rescaled
+from sfm_audit.audit.alignment.positions import (
+    MIN_POSITIONS,
+    NUM_PARAMETERS,
+    PositionAlignment,
+    align_positions,
+    common_covariance,
+)
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
 from sfm_audit.audit.table.thresholds import MAX_PRIOR_CHI2, MAX_PRIOR_SPREAD
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
 from sfm_audit.audit.witnesses.sequence import shared_rms, smoothness_p
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.evidence import NotAsked, PositionPriors
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
@@ -29,6 +36,11 @@ COLUMNS: Final = ("prior_distance", "prior_chi2", "prior_p", "prior_q")
 LEVEL: Final = 0.01  # of the findings about drift and spread
 _DEGREES: Final = 3
 _EXACT: Final = 1e-9  # share of the extent of the priors
+_NEEDED: Final = 8  # positions without covariances
+_MIN_DEGREES: Final = 5.0
+_CUT_SHARE: Final = 0.999
+_MEDIAN_DEGREES: Final = 1.58
+_LEAST_P: Final = 1e-300
 
 
 def ask_priors(evidence: Evidence) -> WitnessReport | None:
@@ -42,13 +54,12 @@ def ask_priors(evidence: Evidence) -> WitnessReport | None:
     quats, shifts = images.quat_cam_from_world_wxyz, images.translation_cam_from_world
     known = usable_poses(quats, shifts) & np.isfinite(priors.position).all(axis=1)
     rows = np.array([i for i in natural_order(images.name) if known[i]], dtype=np.int64)
-    said = _covariances(priors, rows)
-    centre = Poses.of(quats[rows], shifts[rows]).centre
-    found = align_positions(centre, priors.position[rows], said[0], min_spread=1.0 if said[1] else 0.0)
-    if found is None:
-        reason = f"{len(rows)} images have a prior and lie apart, {MIN_POSITIONS} are needed"
+    judged = _judged(Poses.of(quats[rows], shifts[rows]).centre, priors.position[rows], priors.covariance[rows])
+    if judged is None:
+        needed = f"{MIN_POSITIONS} are needed, {_NEEDED} without covariances, that lie apart"
+        reason = f"{len(rows)} images have a prior; {needed}"
         return _silent(evidence.model, f"{priors.location}: {reason}")
-    return _report(evidence.model, priors, rows, (found, said[1]))
+    return _report(evidence.model, priors, rows, judged)
 
 
 def _silent(model: SparseModel, reason: str) -> WitnessReport:
@@ -56,39 +67,86 @@ def _silent(model: SparseModel, reason: str) -> WitnessReport:
     return WitnessReport(None, columns=columns, findings=(Finding(FindingCode.PRIORS_NOT_USED, 1, reason),))
 
 
-def _covariances(priors: PositionPriors, rows: IntArray) -> tuple[FloatArray, bool]:
-    """Return covariances (n, 3, 3), and whether they were said; where one lacks, all are taken as equal."""
-    stored = priors.covariance[rows]
-    if np.isfinite(stored).all() and len(rows):
-        return stored, True
-    return np.tile(np.eye(3), (len(rows), 1, 1)), False
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """Priors beside the model. alignment: as of `align_positions`.    p: (n,) of each, chi2: (n,) equal to it.
+
+    spread: of the priors in units of their covariances; NaN where these were not said.    sd_scale: of the scale.
+    """
+
+    alignment: PositionAlignment
+    p: FloatArray
+    spread: float
+    sd_scale: float
+
+    @property
+    def chi2(self) -> FloatArray:
+        """The value of chi^2 with 3 degrees of freedom that has this p."""
+        value: FloatArray = chdtri(_DEGREES, np.maximum(self.p, _LEAST_P))
+        return value
 
 
-def _report(
-    model: SparseModel, priors: PositionPriors, rows: IntArray, aligned: tuple[PositionAlignment, bool]
-) -> WitnessReport:
-    found, has_covariance = aligned
-    spread = max(found.spread, 1.0) if has_covariance else found.spread
-    extent = np.ptp(priors.position[rows], axis=0).max(initial=0.0)
-    if not has_covariance and not spread > _EXACT * extent:  # copies of each other: no noise to compare with
-        return _silent(model, f"{priors.location}: its priors are the centres of the model")
-    used = rescaled(found, spread)
-    p = prior_p(used.chi2)
-    distance = np.linalg.norm(used.residual, axis=1)
+def _judged(centre: FloatArray, position: FloatArray, covariance: FloatArray) -> _Judged | None:
+    """Align, and judge by the covariances, or by the scatter where one of them is not known."""
+    if np.isfinite(covariance).all():
+        found = align_positions(centre, position, covariance)
+        return None if found is None else _by_covariance(found)
+    return _by_scatter(centre, position)
+
+
+def _by_covariance(found: PositionAlignment) -> _Judged:
+    spread = max(found.spread, 1.0)
+    p = spread_p(found.chi2 / spread**2, len(found.chi2)) if spread > 1.0 else prior_p(found.chi2)
+    return _Judged(found, p, found.spread, found.sd_scale * spread)
+
+
+def _by_scatter(centre: FloatArray, position: FloatArray) -> _Judged | None:
+    """Take one covariance for all, that of the residuals: Hotelling's law, each residual left out of its own."""
+    unit = np.tile(np.eye(3), (len(centre), 1, 1))
+    degrees = len(centre) - NUM_PARAMETERS / _DEGREES
+    if degrees < _MIN_DEGREES:
+        return None
+    cut = float(fdtri(_DEGREES, degrees - 2, _CUT_SHARE)) * _DEGREES * degrees / (degrees - 2)
+    found = align_positions(centre, position, unit, min_spread=0.0, cut=cut)
+    for _ in range(2):
+        if found is None:
+            return None
+        common, degrees = common_covariance(found)
+        extent = np.ptp(position, axis=0).max(initial=0.0)
+        if degrees < _MIN_DEGREES or not np.linalg.eigvalsh(common)[0] > (_EXACT * extent) ** 2:
+            return None
+        found = align_positions(centre, position, np.tile(common, (len(centre), 1, 1)), cut=cut)
+    return None if found is None else _Judged(found, hotelling_p(found, degrees), np.nan, found.sd_scale)
+
+
+def hotelling_p(found: PositionAlignment, degrees: float) -> FloatArray:
+    """Return (n,) p-values where the covariance was estimated from the residuals in the fit.
+
+    A residual in the fit is judged by the covariance of the others, T^2 = d^2 (v - 1) / (v - d^2), with v - 1 degrees
+    of freedom; one outside by that of all, T^2 = d^2 with v; T^2 (m - 2) / (3 m) ~ F(3, m - 2) with m of them.
+    """
+    with np.errstate(all="ignore"):
+        without = np.where(found.chi2 < degrees, found.chi2 * (degrees - 1) / (degrees - found.chi2), np.inf)
+        distance = np.where(found.fitted, without, found.chi2)
+        m = np.where(found.fitted, degrees - 1, degrees)
+        p: FloatArray = fdtrc(_DEGREES, m - 2, distance * (m - 2) / (_DEGREES * m))
+    return p
+
+
+def _report(model: SparseModel, priors: PositionPriors, rows: IntArray, judged: _Judged) -> WitnessReport:
+    distance = np.linalg.norm(judged.alignment.residual, axis=1)
     num_images = len(model.images)
     columns: dict[str, ColumnValues] = {}
-    for name, value in zip(COLUMNS, (distance, used.chi2, p, benjamini_hochberg(p)), strict=True):
+    for name, value in zip(COLUMNS, (distance, judged.chi2, judged.p, benjamini_hochberg(judged.p)), strict=True):
         column = np.full(num_images, np.nan)
         column[rows] = value
         columns[name] = column
     unit = "m" if priors.is_metric else "units of the priors"
     said: list[WitnessStatement | None] = [None] * num_images
     for k, image_idx in enumerate(rows.tolist()):
-        q = float(columns["prior_q"][image_idx])
-        if np.isfinite(used.chi2[k]):
-            said[image_idx] = _statement(distance[k], unit, used.chi2[k], q)
-    findings = tuple(_findings(priors, (found, used), unit, has_covariance=has_covariance))
-    return WitnessReport(Witness.PRIORS, tuple(said), columns, findings)
+        if np.isfinite(judged.p[k]):
+            said[image_idx] = _statement(distance[k], unit, judged.chi2[k], float(columns["prior_q"][image_idx]))
+    return WitnessReport(Witness.PRIORS, tuple(said), columns, tuple(_findings(priors, judged, unit)))
 
 
 def prior_p(chi2: FloatArray) -> FloatArray:
@@ -97,29 +155,31 @@ def prior_p(chi2: FloatArray) -> FloatArray:
     return p
 
 
+def spread_p(chi2: FloatArray, num: int) -> FloatArray:
+    """Return (n,) p-values where the distances were divided by the median of ``num`` of them.
+
+    The median of n values of chi^2_3 has the relative variance 1.265 / n, that of chi^2 with 1.58 n degrees of freedom.
+    """
+    p: FloatArray = fdtrc(_DEGREES, _MEDIAN_DEGREES * num, chi2 / _DEGREES)
+    return p
+
+
 def _statement(distance: float, unit: str, chi2: float, q: float) -> WitnessStatement:
     text = f"its centre is {distance:.3g} {unit} from its prior, chi^2 = {chi2:.3g} of 3, q = {q:.2g}"
     return WitnessStatement(Witness.PRIORS, float(chi2), MAX_PRIOR_CHI2, text, q)
 
 
-def _findings(
-    priors: PositionPriors, aligned: tuple[PositionAlignment, PositionAlignment], unit: str, *, has_covariance: bool
-) -> Iterator[Finding]:
-    found, used = aligned
+def _findings(priors: PositionPriors, judged: _Judged, unit: str) -> Iterator[Finding]:
+    found = judged.alignment
     if priors.is_metric:
-        scale = used.similarity.scale
-        text = f"a unit of the model is {scale:.4g} m of {priors.location} (sd {100 * used.sd_scale / scale:.2g} %)"
+        scale = found.similarity.scale
+        text = f"a unit of the model is {scale:.4g} m of {priors.location} (sd {100 * judged.sd_scale / scale:.2g} %)"
         yield Finding(FindingCode.PRIORS_SCALE, 1, text)
-    kept = _kept(used)
-    if smoothness_p(used.whitened[kept]) < LEVEL:
-        drift = shared_rms(used.residual[kept])
+    kept = found.fitted & np.isfinite(found.whitened).all(axis=1)
+    if smoothness_p(found.whitened[kept]) < LEVEL:
+        drift = shared_rms(found.residual[kept])
         text = f"neighbours in the sequence share {drift:.3g} {unit} RMS of their distance from {priors.location}"
         yield Finding(FindingCode.PRIORS_DRIFT, int(kept.sum()), text)
-    if has_covariance and found.spread > MAX_PRIOR_SPREAD:
-        text = f"{priors.location}: priors scatter {found.spread:.2g} times as widely as their covariances say"
-        yield Finding(FindingCode.PRIORS_SPREAD, len(found.chi2), text)
-
-
-def _kept(used: PositionAlignment) -> BoolArray:
-    kept: BoolArray = used.fitted & np.isfinite(used.whitened).all(axis=1)
-    return kept
+    if judged.spread > MAX_PRIOR_SPREAD:
+        text = f"{priors.location}: priors scatter {judged.spread:.2g} times as widely as their covariances say"
+        yield Finding(FindingCode.PRIORS_SPREAD, len(judged.p), text)

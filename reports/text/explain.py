@@ -23,6 +23,7 @@ from sfm_audit.audit.table.words import (
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.reports.text.reasons import reasons_of
+from sfm_audit.reports.text.witnesses import testimony_lines
 from sfm_audit.reports.text.wording import counted, number, paragraph, plain, probability, px
 
 LIMITS: Final = (
@@ -171,6 +172,7 @@ def render_story(story: Story, width: int = 100) -> str:
         _bullets("Remarks (decide nothing)", remarks, story, width) if remarks else "",
         _finding_lines(row, story.model, width) if story.model else "",
         _verdict_lines(row),
+        testimony_lines(row, width),
         _camera_lines(row, width),
         _number_lines("What it was measured with", _observation_facts(row)),
         _number_lines("Noise", _noise_facts(row)),

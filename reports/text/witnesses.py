@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
-from sfm_audit.reports.text.wording import counted
+from sfm_audit.reports.text.wording import counted, paragraph, plain
 
-NOBODY: Final = "Nobody outside of the images was asked (run --database auto asks verified pairs of a database.db)."
+NOBODY: Final = (
+    "Nobody outside of the images was asked (run --database auto asks verified pairs of a database.db, --reference "
+    "known poses, --priors positions of a sensor)."
+)
 
 
 def witnesses_line(asked: Mapping[str, int], num_models: int, num_images: int, num_spoken_of: int) -> str:
@@ -24,3 +27,15 @@ def witnesses_line(asked: Mapping[str, int], num_models: int, num_images: int, n
     silent = num_images - num_spoken_of
     rest = f"; they can say nothing of {silent} of {counted(num_images, 'image')}" if silent else ""
     return f"Witnesses outside of the images that were asked: {', '.join(said)}{rest}."
+
+
+def testimonies_words(row: Mapping[str, Any]) -> list[str]:
+    """Say what each witness that was asked said of the image of a row of ``RUN/images``, those that agree included."""
+    said = row.get("testimonies") or []
+    return [plain(f"{each['witness']}: {each['text']}") for each in said]
+
+
+def testimony_lines(row: Mapping[str, Any], width: int) -> str:
+    """Return the same as a section of an image's story; empty where no witness said anything."""
+    lines = [paragraph(f"- {text}", width, "  ") for text in testimonies_words(row)]
+    return "\n".join(["What witnesses outside of the image say", *lines]) if lines else ""

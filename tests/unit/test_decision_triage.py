@@ -169,3 +169,13 @@ def test_details_are_those_of_the_diagnosis():
     reasons = ("k1_not_identified: 0.1", "camera_not_optimal: f stored 1, implied 2")
     (frozen,) = triage([image("x", *reasons)], [], "m")
     assert frozen.text.endswith(": f stored 1, implied 2")
+
+
+def test_the_witnesses_that_disagree_are_named_with_how_many_images():
+    rows = [
+        image("a", "reference_disagrees: 3 m", "priors_disagree: 4 m", verdict="undetermined"),
+        image("b", "reference_disagrees: 2 m", RADIAL),
+        image("c", verdict="accepted"),
+    ]
+    (found,) = triage(rows, [ONE], "m")
+    assert found.text == f"{DIAGNOSES[DiagnosisCode.WITNESSES_DISAGREE].meaning} (reference 2, priors 1)"

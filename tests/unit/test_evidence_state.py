@@ -80,3 +80,11 @@ def test_a_reference_that_cannot_be_read_fails_the_model(tmp_path, folder, capsy
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "expected a COLMAP model, images.txt, a TUM" in said
+
+
+def test_a_reference_that_is_not_there_is_said_once(tmp_path, folder, capsys):
+    for option in ("--reference", "--priors"):
+        options = ["-o", str(tmp_path / "out"), option, str(tmp_path / "nothing")]
+        assert main(["run", str(folder), *options]) == 3
+        assert capsys.readouterr().err.count("there is no such file") == 1
+        assert not (tmp_path / "out").exists()
