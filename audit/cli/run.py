@@ -129,9 +129,7 @@ def command(  # one parameter per option
     in RUN/errors, all others were audited). Of 2 to 5 the highest that applies.
     """
     config = read_config(config_file, {name: options[name] for name in _SETTINGS})
-    refuse_lost("--database", config.database, folder="name the database.db in it, or auto")
-    refuse_lost("--reference", config.reference)
-    refuse_lost("--priors", config.priors, folder="name the CSV or database in it, or auto")
+    _refuse_lost(config)
     wanted = wanted_of(**{name: options[name] for name in CHOICE_OF_MODELS})
     if options["only_list"] and options["as_json"]:
         raise click.UsageError("--list and --json exclude each other; --list is a table with tabs.")
@@ -167,6 +165,12 @@ def command(  # one parameter per option
     elif not options["quiet"] and (out / "run.json").exists():
         print_summary(out)
     return exit_code
+
+
+def _refuse_lost(config: AuditConfig) -> None:
+    refuse_lost("--database", config.database, folder="name the database.db in it, or auto")
+    refuse_lost("--reference", config.reference)
+    refuse_lost("--priors", config.priors, folder="name the CSV or database in it, or auto")
 
 
 def _print_json(folder: Path, exit_code: ExitCode) -> None:

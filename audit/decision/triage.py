@@ -158,9 +158,9 @@ def _details(code: DiagnosisCode, rows: Sequence[Row], camera: Row | None) -> st
         texts = Counter(_text_of(row, ReasonCode.CAMERA_NOT_OPTIMAL) for row in rows)
         return f": {texts.most_common(1)[0][0]}"
     if code is DiagnosisCode.WITNESSES_DISAGREE:
-        said = [reason.partition(":")[0] for row in rows for reason in row["reasons"]]
-        asked = {witness: said.count(reason) for witness, reason in WITNESS_CODES.items() if reason in said}
-        return f" ({', '.join(f'{witness} {count}' for witness, count in asked.items())})"
+        against = Counter(reason.partition(":")[0] for row in rows for reason in row["reasons"])
+        told = [f"{witness} {against[reason]}" for witness, reason in WITNESS_CODES.items() if against[reason]]
+        return f" ({', '.join(told)})"
     if code in {DiagnosisCode.OWN_LENSES, DiagnosisCode.OWN_FIELDS}:
         named = Counter(row["misfit_group"] for row in rows if row["misfit_group"])
         return f" ({', '.join(f'{group} {count}' for group, count in named.most_common(3))})" if named else ""
