@@ -12,6 +12,7 @@ from sfm_audit.reports.text.wording import counted, paragraph, plain, shorten
 
 REASON_COLUMNS: Final = ("image_name", str(Member.MISFIT), "advised_camera_model", "reasons")
 MAX_ADVICE: Final = 3
+_REASONS_TITLE: Final = "Why images are not accepted (what to do: sfm-audit explain-code CODE)"
 
 
 def reasons_of(row: Row) -> list[Row]:
@@ -68,7 +69,10 @@ def reasons_part(run: RunReader, width: int) -> list[str]:
         *_advice("where less would do", simpler, width),
     ]
     parts = [
-        ("Why images are not accepted", reasons.lines(width)),
+        (
+            paragraph("Why images are not accepted (what to do: sfm-audit explain-code CODE)", width),
+            reasons.lines(width),
+        ),
         ("Remarks (decide nothing)", remarks.lines(width)),
         ("Advised camera models", advice),
     ]

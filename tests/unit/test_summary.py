@@ -147,6 +147,7 @@ def test_remarks_are_not_told_as_reasons(run_folder):
         reasons=[[remark, untested], ["misfit_radial: 0.42 px", untested], [untested, "low_coverage: 2 %", remark]],
     )
     reasons, remarks = section(text, "Why images are not accepted"), section(text, "Remarks (decide nothing)")
+    assert reasons.startswith("Why images are not accepted (what to do: sfm-audit explain-code CODE)\n")
     assert "misfit_radial  1 image, IMG_0001.jpg: 0.42 px" in reasons
     assert "misfit_not_tested  1 image, IMG_0002.jpg" in reasons
     assert "low_coverage  1 image" in reasons
