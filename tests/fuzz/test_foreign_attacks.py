@@ -1,6 +1,7 @@
 """Files that somebody made to hurt: each costs one line or is a model, and little memory, whatever it declares."""
 
 import gc
+import importlib
 import json
 import os
 import tracemalloc
@@ -15,6 +16,7 @@ from model_promises import assert_is_a_model
 from sfm_audit.loaders import LoadError, open_model
 from sfm_audit.loaders.datasets.input_state import read_input_state
 
+importlib.import_module("pyarrow.csv")  # an import is no memory that a file takes
 MADE = fs.scene({"k1": -0.08, "k2": 0.0}, num_images=2, num_points=3)
 MAX_BYTES = 96 << 20
 """Of memory that Python takes for a file of at most 10 MB."""
