@@ -29,6 +29,46 @@ def test_axes_of_a_photogroup_are_those_it_names(tmp_path, orientation):
     assert_allclose(residuals_of(model)[1], by_image(made, fs.residuals(made)), atol=1e-8)
 
 
+BENTLEY_ROTATION = (-0.9999982912233401, -0.001636319085375301, -0.0008602425863163225, -0.001631068695467463)
+BENTLEY_ROTATION += (0.9999802528616577, -0.00606906089589293, 0.0008701565192966738, -0.006067647409696231)
+BENTLEY_ROTATION += (-0.9999812130648239,)
+BENTLEY_POINTS = {
+    (652119.8871409688, 6863304.305716386, 87.79328384995461): (3324.26001, 9930.269531),
+    (652123.2211166573, 6863245.976366176, 80.07999999914318): (3296.56, 9253.75),
+}
+
+
+def test_the_example_of_bentley_s_specification_has_residuals_below_a_pixel(tmp_path):
+    """BlocksExchange XML/XMLZ format, version 2.1: photo 146, a tie point and control point 2, as measured there."""
+    tag = fs.tag
+    numbers = dict(zip((f"M_{row}{column}" for row in range(3) for column in range(3)), BENTLEY_ROTATION, strict=True))
+    centre = {"x": 651999.7159189156, "y": 6863073.633923346, "z": 1318.897690166719}
+    pose = tag(
+        "Pose", tag("Rotation", *map(tag, numbers, numbers.values())), tag("Center", *map(tag, centre, centre.values()))
+    )
+    lens = {"K1": -0.0010041516639, "K2": 0.0056007056563, "K3": -0.009874171117100001, "P1": 0, "P2": 0}
+    group = [
+        tag("ImageDimensions", tag("Width", 9420), tag("Height", 14430)),
+        tag("FocalLengthPixels", 13991.05582),
+        tag("CameraOrientation", "XRightYDown"),
+        tag("PrincipalPoint", tag("x", 4683.755692), tag("y", 7223.0141002)),
+        tag("Distortion", *map(tag, lens, lens.values())),
+        tag("Photo", tag("Id", 146), tag("ImagePath", "071_2810.jpg"), pose),
+    ]
+    ties = [
+        tag(
+            "TiePoint",
+            tag("Position", *map(tag, "xyz", xyz)),
+            tag("Measurement", tag("PhotoId", 146), *map(tag, "xy", xy)),
+        )
+        for xyz, xy in BENTLEY_POINTS.items()
+    ]
+    block = tag("Block", tag("Photogroups", tag("Photogroup", *group)), tag("TiePoints", *ties))
+    model = open_model(fs.write(tmp_path, {"BlocksExchange.xml": tag("BlocksExchange", block).encode()}))
+    assert model.image(0).camera.model.name == "RADIAL_3"
+    assert np.hypot(*residuals_of(model)[1].T).max() < 0.4  # half a pixel beside it would be 0.6 and more
+
+
 SYSTEMS = fs.tag("SpatialReferenceSystems", fs.tag("SRS", fs.tag("Id", 0), fs.tag("Definition", "EPSG:4326")))
 
 
