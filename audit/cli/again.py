@@ -103,6 +103,10 @@ def _rejecting_codes(context: click.Context, param: click.Parameter, values: tup
     return tuple(ReasonCode(value) for value in values)
 
 
+GIVEN: Final = ("covariance", "database", "priors", "reference")
+"""Settings that say what was looked at besides the model: a run keeps what it was given, whatever decides."""
+
+
 def settings_of(run: RunReader) -> AuditConfig:
     """Return the settings that a run was made with.
 
@@ -133,6 +137,7 @@ def under(run: RunReader, settings: AuditConfig, rejections: CountedRejections |
         A setting changes what is measured, or is smaller than the run's; or its tables lack numbers that decide.
     """
     own, rule = settings_of(run), rejections or CountedRejections()
+    settings = settings.model_copy(update={name: getattr(own, name) for name in GIVEN})
     if settings == own and not rule:
         return run
     changed = [

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from sfm_audit.audit.cli.again import Again, under, valid_settings
+from sfm_audit.audit.cli.again import GIVEN, Again, under, valid_settings
 from sfm_audit.audit.cli.errors import ExitCode, KnownError, complain
 from sfm_audit.audit.cli.terminal import is_stdout, write_stdout
 from sfm_audit.reports.compare.comparison import MissingColumnError, RunSnapshot
@@ -50,9 +50,6 @@ class ComparedRun:
             for item in failures
             if (item["kind"] in INPUT_KINDS) is of_inputs
         ]
-
-
-_OF_THE_NIGHT = frozenset({"database", "reference", "priors"})  # what was given besides a model, each night its own
 
 
 def read_run(folder: Path, again: Again | None = None) -> ComparedRun:
@@ -129,7 +126,7 @@ def different_settings(runs: Sequence[ComparedRun]) -> str | None:
     first = runs[0]
     for other in runs[1:]:
         old, new = first.info["config"], other.info["config"]
-        for name in sorted((old.keys() & new.keys()) - _OF_THE_NIGHT):
+        for name in sorted((old.keys() & new.keys()) - set(GIVEN)):  # another night, another database
             if old[name] != new[name]:
                 return f"{other.folder} was made with {name} = {new[name]}, {first.folder} with {old[name]}"
     return None

@@ -54,7 +54,7 @@ DIAGNOSES: Final[dict[DiagnosisCode, DiagnosisWords]] = {
     DiagnosisCode.WITNESSES_DISAGREE: DiagnosisWords(
         "witnesses outside of the images contradict their places",
         "look at these images before anything else is believed",
-        "sfm-audit filter RUN --policy full --list kept.txt",
+        "sfm-audit filter RUN --keep accepted --list kept.txt",
     ),
     DiagnosisCode.IMPLAUSIBLE_CAMERAS: DiagnosisWords(
         "cameras that no camera is like (focal length, fold or principal point)",

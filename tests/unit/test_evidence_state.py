@@ -88,3 +88,17 @@ def test_a_reference_that_is_not_there_is_said_once(tmp_path, folder, capsys):
         assert main(["run", str(folder), *options]) == 3
         assert capsys.readouterr().err.count("there is no such file") == 1
         assert not (tmp_path / "out").exists()
+
+
+def test_two_nights_with_other_references_are_compared_as_they_are(tmp_path, folder, capsys):
+    for night, seed in (("one", 1), ("two", 2)):
+        reference = write_text(tmp_path / f"reference {night}", noisy_model(seed))
+        audited(folder, tmp_path / night, "--reference", str(reference))
+    capsys.readouterr()
+    assert main(["diff", str(tmp_path / "one"), str(tmp_path / "two")]) == 0
+    gate = tmp_path / "gate.toml"
+    gate.write_text("")
+    code = main(["check", str(tmp_path / "two"), "--baseline", str(tmp_path / "one"), "--policy-file", str(gate)])
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    assert "decided again" not in said.out
