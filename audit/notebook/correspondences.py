@@ -96,7 +96,8 @@ def _array(values: ArrayLike, name: str) -> FloatArray:
     if given.dtype.kind == "O" and given.size and all(isinstance(each, int | float | np.number) for each in given.flat):
         given = given.astype(np.float64)
     if given.dtype.kind not in "iuf":
-        found = type(values).__name__ if given.ndim == 0 else f"an array of {given.dtype}"
+        what = "text" if given.dtype.kind in "US" else given.dtype.name
+        found = type(values).__name__ if given.ndim == 0 else f"an array of {what}"
         raise ValueError(f"{name}: expected numbers in rows of one length, found {found}")
     return np.ascontiguousarray(given, dtype=np.float64)
 
@@ -122,6 +123,12 @@ def _pose(pose: Any) -> tuple[FloatArray, FloatArray]:
     return np.array([w, x, y, z]), matrix[:3, 3].copy()
 
 
+def _is_side(value: Any) -> bool:
+    """Whether a value is a number of px, as 1280 or 1280.0."""
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    return is_number and float(value).is_integer() and 0 < float(value) < _MAX_SIDE
+
+
 def _camera(camera: Any) -> CameraRecord:
     if isinstance(camera, CameraRecord):
         return camera
@@ -134,7 +141,7 @@ def _camera(camera: Any) -> CameraRecord:
     model = BY_NAME.get(str(getattr(model_name, "name", model_name)))
     if model is None:
         raise ValueError(f"camera: expected a model of COLMAP's ({', '.join(BY_NAME)}), found {model_name!r:.60}")
-    if not all(isinstance(side, int | np.integer) and 0 < side < _MAX_SIDE for side in (width, height)):
+    if not (_is_side(width) and _is_side(height)):
         raise ValueError(f"camera: expected a width and a height in whole px, found {width!r:.40} and {height!r:.40}")
     values = _array(params, "camera")
     if values.shape != (model.num_params,):
