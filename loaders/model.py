@@ -132,7 +132,7 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.WEAKLY_CONNECTED: "parts of the model hang together by few points, or by one image or pair alone",
     FindingCode.RIG_POSE_DISAGREES: "poses in the images file differ from those of frames and rigs, which were read",
     FindingCode.RIG_NOT_CONSTANT: "images of a rig would move against their frame: the rig is not rigid, or misplaced",
-    FindingCode.POSSIBLE_FOLD: "two groups of images side by side see different points: folded, or two times of day",
+    FindingCode.POSSIBLE_FOLD: "two groups side by side see other points: missing matches, two times of day, or a fold",
     FindingCode.REFERENCE_NOT_USED: "the reference has nothing on the model, or no part of it fits: it was not asked",
     FindingCode.REFERENCE_SCALE: "how long a unit of the model is in the metres of its reference",
     FindingCode.REFERENCE_DRIFT: "neighbours in the sequence share their distance from the reference: the model bends",

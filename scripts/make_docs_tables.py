@@ -129,7 +129,7 @@ the same list and decide nothing: an accepted image may carry them. A code leads
 - KS and `verdict_noise` judge the noise, misfit the camera. KS rejects a correct camera whose noise is not what the
   model of the noise says, and with few observations it accepts a wrong lens.
 - An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration (a repeated facade
-  matched to the wrong copy), global scale, or drift. What witnesses outside see of it: docs/witnesses.md.
+  matched to the wrong copy), global scale, or drift. Who can, with what input and how often: docs/witnesses.md.
 - A pose that was adjusted together with its error is at its optimum: `verdict_pose` finds poses that were changed, or
   not adjusted, afterwards.
 - Effects below `--min-effect` are no reason to reject, however significant they are; in the tables they stand all the
@@ -148,7 +148,7 @@ def table_page() -> str:
     """Return docs/tables.md."""
     parts = [TABLES_INTRODUCTION]
     for name, columns in TABLES.items():
-        rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(c.meaning)} |" for c in columns]
+        rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(_meaning(c))} |" for c in columns]
         table = "\n".join(["| column | type | unit | meaning |", "|---|---|---|---|", *rows])
         parts.append(f"## `{name}`\n\n{HEADERS[name]}\n\n{table}\n")
         if name == "images":
@@ -157,7 +157,7 @@ def table_page() -> str:
 
 
 def _group(name: str, columns: Sequence[Column]) -> str:
-    rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(c.meaning)} |" for c in columns]
+    rows = [f"| `{c.name}` | {_arrow(str(c.type))} | {c.unit} | {_cell(_meaning(c))} |" for c in columns]
     table = "\n".join(["| column | type | unit | meaning |", "|---|---|---|---|", *rows])
     return f"### `images`, only with `--{name}`\n\n{table}\n"
 
@@ -222,6 +222,10 @@ def main() -> int:
             print(f"{path}: not what the code says; run scripts/make_docs_tables.py", file=sys.stderr)
             stale = 1
     return stale
+
+
+def _meaning(column: Column) -> str:
+    return f"{column.meaning}; gauge: {column.gauge}" if column.gauge else column.meaning
 
 
 def _arrow(kind: str) -> str:

@@ -1,19 +1,21 @@
 """How often is a folded model noticed, and a right one suspected? From the model alone, and against another model.
 
-    .venv/bin/python scripts/study_folds.py               # 6 buildings of each kind, about 10 minutes
+    .venv/bin/python scripts/study_folds.py               # 6 buildings of each kind, about 15 minutes
     .venv/bin/python scripts/study_folds.py --quick       # 1 of each kind
     .venv/bin/python scripts/study_folds.py --photos DIR  # healthy models, DIR/NAME/{sparse/0,database.db}
 
 Buildings are simulated, matched, verified and mapped by COLMAP: `turned`, a box that looks the same from opposite
-sides, and `street`, a facade that repeats itself every 8 m. Each is mapped twice: from all matches (it may fold), and
-from the true ones alone (a right model). Whether a model is folded is asked of the true poses. With --photos the models
-are verified and mapped again with another seed, and every difference is a false alarm.
+sides, `tower`, a square one that looks the same from four, and `street`, a facade that repeats itself every 8 m. Each
+is mapped twice: from all matches (it may fold), and from the true ones alone (a right model). Whether a model is folded
+is asked of the true poses. With --photos the models are verified and mapped again with another seed, and every
+difference is a false alarm; what the model alone says is told of the whole, and of its images that healthy.json names.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import shutil
 import sqlite3
 import tempfile
@@ -24,132 +26,28 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scripts.folds.buildings import (
+    HEIGHT,
+    WIDTH,
+    Building,
+    Photo,
+    matches,
+    photographs,
+    street_building,
+    tower_building,
+    turned_building,
+)
 from sfm_audit.audit.alignment import PoseComparison, Poses, compare_poses
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.table.witnesses import wilson_upper
-from sfm_audit.audit.witnesses.fold import Fold, find_fold
+from sfm_audit.audit.witnesses.fold import MIN_IMAGES, Fold, find_fold
 from sfm_audit.audit.witnesses.should_see import should_see
 from sfm_audit.loaders import SparseModel, open_model
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
-WIDTH, HEIGHT, FOCAL = 1200, 900, 960.0
-NUM_CAMERAS = 40
-HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-PERIOD, UNITS = 8.0, 5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Building:
-    """Points that are photographed.
-
-    xyz, normal: (n, 3).    looks: (n,) equal numbers look the same.    copy: (n,) repetition that a point is in.
-    unit: typical depth, m.    turned: whether copies are turned against each other, or shifted.
-    """
-
-    xyz: FloatArray
-    normal: FloatArray
-    looks: IntArray
-    copy: IntArray
-    cameras: Poses
-    unit: float
-    turned: bool
-
-
-def turned_building(rng: np.random.Generator, num_unique: int) -> Building:
-    """A box of 10 x 6 x 6 m, the same from opposite sides, and cameras on a circle around it."""
-    walls, normals, looks, copies = [], [], [], []
-    for axis, (half, away) in enumerate(((5.0, 3.0), (3.0, 5.0))):
-        wall = np.c_[rng.uniform(-half, half, 330), away - rng.uniform(0, 0.4, 330), rng.uniform(0, 6, 330)]
-        wall = wall if axis == 0 else wall[:, [1, 0, 2]]
-        outward = np.eye(3)[1 - axis]
-        for copy in range(2):
-            turn = HALF_TURN if copy else np.eye(3)
-            walls.append(wall @ turn)
-            normals.append(np.tile(outward @ turn, (330, 1)))
-            looks.append(np.arange(330) + 330 * axis)
-            copies.append(np.full(330, copy))
-    angle, radius = rng.uniform(0, 2 * np.pi, num_unique), rng.uniform(6.5, 9, num_unique)
-    ground = np.c_[radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0, 0.8, num_unique)]
-    around = np.c_[np.cos(angle), np.sin(angle), np.zeros(num_unique)]
-    theta = 2 * np.pi * np.arange(NUM_CAMERAS) / NUM_CAMERAS + rng.normal(0, 0.02, NUM_CAMERAS)
-    centre = np.c_[17 * np.cos(theta), 17 * np.sin(theta), 2 + rng.normal(0, 0.3, NUM_CAMERAS)]
-    return Building(
-        np.concatenate([*walls, ground]),
-        np.concatenate([*normals, around]),
-        np.concatenate([*looks, 660 + np.arange(num_unique)]),
-        np.concatenate([*copies, np.zeros(num_unique, np.int64)]),
-        looking(centre, np.array([0, 0, 2.5]) + rng.normal(0, 0.3, (NUM_CAMERAS, 3))),
-        14.0,
-        turned=True,
-    )
-
-
-def street_building(rng: np.random.Generator, num_unique: int) -> Building:
-    """A facade of five equal units, and cameras that walk along it."""
-    unit = np.c_[rng.uniform(0, PERIOD, 260), -rng.uniform(0, 0.8, 260), rng.uniform(0, 7, 260)]
-    length = PERIOD * UNITS
-    shifts = [unit + np.array([PERIOD * k, 0, 0]) for k in range(UNITS)]
-    own = np.c_[rng.uniform(0, length, num_unique), rng.uniform(-0.5, 2, num_unique), rng.uniform(0, 5, num_unique)]
-    xyz = np.concatenate([*shifts, own])
-    along = np.linspace(2, length - 2, NUM_CAMERAS) + rng.normal(0, 0.1, NUM_CAMERAS)
-    centre = np.c_[along, 9 + rng.normal(0, 0.4, NUM_CAMERAS), 2 + rng.normal(0, 0.3, NUM_CAMERAS)]
-    aim = np.c_[along + rng.normal(0, 1.5, NUM_CAMERAS), np.zeros(NUM_CAMERAS), np.full(NUM_CAMERAS, 3.0)]
-    return Building(
-        xyz,
-        np.tile([0.0, 1.0, 0.0], (len(xyz), 1)),
-        np.concatenate([np.tile(np.arange(260), UNITS), 260 + np.arange(num_unique)]),
-        np.concatenate([np.repeat(np.arange(UNITS), 260), np.zeros(num_unique, np.int64)]),
-        looking(centre, aim),
-        9.0,
-        turned=False,
-    )
-
-
-def looking(centre: FloatArray, at: FloatArray) -> Poses:
-    """Return upright cameras that look at points."""
-    forward = (at - centre) / np.linalg.norm(at - centre, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return Poses(np.stack([right, np.cross(forward, right), forward], axis=1), centre)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Photo:
-    """What one camera sees: points (k,), keypoints (k, 2) px, unit rays to the camera (k, 3)."""
-
-    point: IntArray
-    xy_px: FloatArray
-    ray: FloatArray
-
-
-def photographs(rng: np.random.Generator, building: Building) -> list[Photo]:
-    """Photograph points before the camera, inside, at less than 72 degrees from the wall's normal; 65 % of them."""
-    out = []
-    for rotation, centre in zip(building.cameras.rotation, building.cameras.centre, strict=True):
-        cam = (building.xyz - centre) @ rotation.T
-        xy = FOCAL * cam[:, :2] / cam[:, 2:] + [WIDTH / 2, HEIGHT / 2]
-        ray = centre - building.xyz
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        seen = (cam[:, 2] > 0) & (xy > 0).all(axis=1) & (xy < [WIDTH, HEIGHT]).all(axis=1)
-        seen &= ((ray * building.normal).sum(axis=1) > np.cos(np.radians(72))) & (rng.random(len(ray)) < 0.65)
-        point = np.flatnonzero(seen)
-        out.append(Photo(point, xy[point] + rng.normal(0, 0.4, (len(point), 2)), ray[point]))
-    return out
-
-
-def matches(rng: np.random.Generator, building: Building, photos: list[Photo]) -> dict[tuple[int, int], IntArray]:
-    """Match what looks the same, less often the more the directions differ, as descriptors do."""
-    out = {}
-    for i, a in enumerate(photos):
-        for j, b in enumerate(photos[:i]):
-            _, in_a, in_b = np.intersect1d(building.looks[a.point], building.looks[b.point], return_indices=True)
-            other = building.copy[a.point[in_a]] != building.copy[b.point[in_b]]
-            ray = np.where(other[:, None] & building.turned, b.ray[in_b] @ HALF_TURN, b.ray[in_b])
-            angle = np.degrees(np.arccos(np.clip((a.ray[in_a] * ray).sum(axis=1), -1, 1)))
-            kept = rng.random(len(angle)) < np.exp(-((angle / 32) ** 2))
-            if np.count_nonzero(kept) >= 12:
-                out[j, i] = np.c_[in_b[kept], in_a[kept]]
-    return out
+_MIN_PHOTOS = 8
+_RIGHT_SHARE = 0.8
+"""Of a model's images that have to be healthy, for the model to be a right one."""
 
 
 def mapped(folder: Path, photos: list[Photo], pairs: dict[tuple[int, int], IntArray]) -> Path | None:
@@ -239,9 +137,9 @@ def right_share(found: Fold | None, moved: FloatArray) -> float:
 
 def buildings(num: int) -> Iterator[tuple[str, Building, int]]:
     """Yield name, building and seed: every other one with few unique points."""
+    makers = (("turned", turned_building, 400), ("street", street_building, 300), ("tower", tower_building, 400))
     for k in range(num):
-        for name, make in (("turned", turned_building), ("street", street_building)):
-            many = {"turned": 400, "street": 300}[name]
+        for name, make, many in makers:
             unique = many if k % 2 == 0 else many // 3
             yield f"{name}, {unique} unique points", make(np.random.default_rng(7000 + k), unique), 7000 + k
 
@@ -289,43 +187,66 @@ def _truth(building: Building, model: SparseModel) -> PoseComparison | None:
     return compare_poses(true, poses_of(model), building.unit)
 
 
+@dataclass
+class Photos:
+    """Counts over models of real photos.
+
+    models, torn: mapped again, and with a fragment then.    images, moved: healthy ones of these, and elsewhere then.
+    asked, remarked: right models of which the model alone says something, and remarked on.
+    """
+
+    models: int = 0
+    torn: int = 0
+    images: int = 0
+    moved: int = 0
+    asked: int = 0
+    remarked: int = 0
+
+
 def study_photos(folder: Path) -> None:
     """Map models of real photos again with another seed, and print what differs."""
-    num_images = num_moved = num_remarked = num_models = num_torn = 0
+    counts = Photos()
     for database in sorted(folder.glob("*/database.db")):
         first = database.parent / "sparse/0"
-        if not (first / "images.bin").exists():
-            continue
-        before = open_model(str(first))
-        if len(before.images) < 8:
-            continue
-        with tempfile.TemporaryDirectory() as scratch:
-            path = map_database(verified_again(database, Path(scratch)), Path(scratch), 2)
-            after = open_model(str(path)) if path else None
-        residuals = model_residuals(before)
-        depth = median_depth(before)
-        found = against(before, after, depth) if after else None
-        fold = find_fold(should_see(before, residuals))
-        num_models += 1
-        num_remarked += bool(fold and fold.is_remarkable)
-        said = "cannot be compared"
-        if found is not None:
-            num_images += len(found.main)
-            num_moved += int(found.moved.sum())
-            num_torn += bool(found.fragments)
-            said = (
-                f"{len(found.fragments)} fragments, {int(found.moved.sum())} of {len(found.main)} moved, centres "
-                f"{np.median(found.centre_error):.2g} median depths, {np.median(found.rotation_deg):.2g} deg, bending "
-                f"{found.bending:.2g}"
-            )
-        print(
-            f"{database.parent.name}: {len(before.images)} images; mapped again: {said}; alone: {told(fold)}",
-            flush=True,
-        )
+        if (first / "images.bin").exists():
+            before = open_model(str(first))
+            if len(before.images) >= _MIN_PHOTOS:
+                print(f"{database.parent.name}: {_photos(before, database, counts)}", flush=True)
     print(
-        f"{num_torn} of {num_models} models torn, {num_moved} of {num_images} images moved (Wilson's upper bound "
-        f"{wilson_upper(num_moved, num_images):.2%}), {num_remarked} of {num_models} remarked on"
+        f"{counts.torn} of {counts.models} models torn, {counts.moved} of {counts.images} images moved (Wilson's upper "
+        f"bound {wilson_upper(counts.moved, counts.images):.2%}); model alone: {counts.remarked} of {counts.asked} "
+        f"right models remarked on (upper bound {wilson_upper(counts.remarked, counts.asked):.0%})"
     )
+
+
+def _photos(before: SparseModel, database: Path, counts: Photos) -> str:
+    """Count one model, and say what was found."""
+    proven = database.with_name("healthy.json")
+    names = (
+        set(json.loads(proven.read_text(encoding="utf-8"))["images"]) if proven.exists() else set(before.images.name)
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        path = map_database(verified_again(database, Path(scratch)), Path(scratch), 2)
+        after = open_model(str(path)) if path else None
+    found = against(before, after, median_depth(before)) if after else None
+    fold = fold_of(before) if len(before.images) >= MIN_IMAGES else None
+    is_right = len(names) >= _RIGHT_SHARE * len(before.images)
+    counts.asked += fold is not None and is_right
+    counts.remarked += bool(fold and fold.is_remarkable and is_right)
+    said = "cannot be compared"
+    if found is not None and after is not None:
+        common = sorted(set(before.images.name) & set(after.images.name))
+        healthy = np.array([name in names for name in common])
+        counts.models += 1
+        counts.torn += bool(found.fragments)
+        counts.images += int(healthy.sum())
+        counts.moved += int((found.moved & healthy).sum())
+        said = (
+            f"{len(found.fragments)} fragments, {int(found.moved.sum())} of {len(found.main)} moved, centres "
+            f"{np.median(found.centre_error):.2g} median depths, {np.median(found.rotation_deg):.2g} deg, bending "
+            f"{found.bending:.2g}"
+        )
+    return f"{len(before.images)} images, {len(names)} healthy; mapped again: {said}; alone: {told(fold)}"
 
 
 def median_depth(model: SparseModel) -> float:

@@ -3,7 +3,8 @@
     python scripts/study_pairs.py [FOLDER...]     simulated scenes, and the models with a database below each FOLDER
     python scripts/study_pairs.py --quick         a few simulated scenes; fails when a number leaves its band
 
-A model counts as healthy unless a truth.json beside its database says ``"folded": true``. In healthy models some
+A model counts as healthy unless a truth.json beside its database says ``"folded": true``; of a model with a
+healthy.json (scripts/study_healthy.py) only the images that it names count. In healthy models some
 cameras are then moved, one at a time and without adjusting anything afterwards: turned by 1 and by 0.3 degrees about a
 random axis through their centre, and shifted by 3 % of the median depth of their points in a random direction.
 """
@@ -52,7 +53,8 @@ MIN_POWER: Final = (0.8, 0.1, 0.8)
 class Tally:
     """Counts of one group of models.
 
-    models, images, spoken_of, against: as they stand.    strong, contradicted: pairs.    found: models with finding.
+    models, images, spoken_of, against: as they stand.    others, others_against: spoken of, not shown to be healthy.
+    strong, contradicted: pairs.    found: models with finding.
     moved, seen: cameras moved that are spoken of, and found, by move.    beside, wronged: other images then.
     """
 
@@ -60,6 +62,8 @@ class Tally:
     images: int = 0
     spoken_of: int = 0
     against: int = 0
+    others: int = 0
+    others_against: int = 0
     strong: int = 0
     contradicted: int = 0
     found: int = 0
@@ -81,9 +85,9 @@ def main() -> int:
     for name, model, source in _simulated(3 if args.quick else 12):
         _add(tallies.setdefault(name, Tally()), model, source, rng, num_moved=args.moved)
     for folder in args.folders:
-        for name, model, source in _stored(folder):
+        for name, model, source, healthy in _stored(folder):
             num_moved = 0 if name.startswith("folded") else args.moved
-            _add(tallies.setdefault(name, Tally()), model, source, rng, num_moved=num_moved)
+            _add(tallies.setdefault(name, Tally()), model, source, rng, num_moved=num_moved, healthy=healthy)
     print("\n".join(_lines(tallies)))
     return _in_band(tallies["simulated"]) if args.quick else 0
 
@@ -98,46 +102,66 @@ def _simulated(num: int) -> Iterator[tuple[str, SparseModel, PairSource]]:
         yield "simulated", model, OwnPairs(model)
 
 
-def _stored(folder: str) -> Iterator[tuple[str, SparseModel, PairSource]]:
-    """Models below a folder that have a database; those that do not fit theirs are named."""
+def _stored(folder: str) -> Iterator[tuple[str, SparseModel, PairSource, set[str] | None]]:
+    """Models below a folder that have a database, and their images that are healthy, None for all.
+
+    Models that do not fit their database are named.
+    """
     for ref in discover([folder]).refs:
         path = find_database(ref.location)
         if path is None:
             continue
         truth = path.with_name("truth.json")
+        proven = path.with_name("healthy.json")
+        healthy = set(json.loads(proven.read_text(encoding="utf-8"))["images"]) if proven.exists() else None
         folded = truth.exists() and json.loads(truth.read_text(encoding="utf-8"))["folded"]
         group = "folded" if folded else "healthy"
         try:
             model = open_model(ref.location)
-            yield f"{group}, {Path(folder).name}", model, DatabasePairs(path, model)
+            yield f"{group}, {Path(folder).name}", model, DatabasePairs(path, model), healthy
         except LoadError as error:
             print(f"left out: {error}", file=sys.stderr)
 
 
-def _add(tally: Tally, model: SparseModel, source: PairSource, rng: np.random.Generator, *, num_moved: int) -> None:
+def _add(
+    tally: Tally,
+    model: SparseModel,
+    source: PairSource,
+    rng: np.random.Generator,
+    *,
+    num_moved: int,
+    healthy: set[str] | None = None,
+) -> None:
+    counts = np.array([healthy is None or name in healthy for name in model.images.name])
     auditor = ModelAuditor(model)
     report = _ask(auditor, auditor.sigma_constant_px, source)
     if report is None:
         return
     against = _against(report)
+    spoken = np.array([each is not None for each in report.testimonies])
+    tally.others += int((spoken & ~counts).sum())
+    tally.others_against += int((against & ~counts).sum())
+    for image_idx in np.flatnonzero(against).tolist():
+        print(f"{model.location}, {model.images.name[image_idx]}: {report.testimonies[image_idx]}", file=sys.stderr)
+    against &= counts
     tally.models += 1
-    tally.images += len(model.images)
-    tally.spoken_of += sum(each is not None for each in report.testimonies)
+    tally.images += int(counts.sum())
+    spoken_of = np.flatnonzero(spoken & counts)
+    tally.spoken_of += len(spoken_of)
     tally.against += int(against.sum())
     tally.strong += sum(map(int, report.columns["num_pairs_strong"])) // 2
     tally.contradicted += sum(map(int, report.columns["num_pairs_contradicting"])) // 2
     tally.found += any(each.code is FindingCode.CONTRADICTED_PAIRS for each in report.findings)
-    spoken_of = np.flatnonzero([each is not None for each in report.testimonies])
     for image_idx in rng.permutation(spoken_of)[:num_moved].tolist():
         for move, (turn_deg, shift) in MOVES.items():
             moved = ModelAuditor(_moved(auditor, image_idx, turn_deg, shift, rng))
             said = _ask(moved, auditor.sigma_constant_px, source)
             if said is None:
                 continue
-            now = _against(said)
+            now = _against(said) & counts
             tally.moved[move] += 1
             tally.seen[move] += bool(now[image_idx])
-            tally.beside += len(now) - 1
+            tally.beside += int(counts.sum()) - 1
             tally.wronged += int(now.sum()) - bool(now[image_idx])
 
 
@@ -171,16 +195,23 @@ def _moved(
     return replace(model, images=images)
 
 
+_HEADER: Final = (
+    *("models", "number", "images", "spoken of", "disagrees", "share, upper end", "of others"),
+    *("strong pairs", "contradict", "finding"),
+)
+
+
 def _lines(tallies: dict[str, Tally]) -> Sequence[str]:
     """Two tables: models as they stand, and with one camera moved."""
     lines = [
-        "| models | number | images | spoken of | disagrees | share, upper end | strong pairs | contradict | finding |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| {' | '.join(_HEADER)} |",
+        "|---" * len(_HEADER) + "|",
     ]
     for name, t in tallies.items():
         share = f"{t.against / max(t.spoken_of, 1):.1%}, {wilson_upper(t.against, t.spoken_of):.1%}"
         counts = f"{t.models} | {t.images} | {t.spoken_of} | {t.against}"
-        lines.append(f"| {name} | {counts} | {share} | {t.strong} | {t.contradicted} | {t.found} |")
+        others = f"{t.others_against} of {t.others}"
+        lines.append(f"| {name} | {counts} | {share} | {others} | {t.strong} | {t.contradicted} | {t.found} |")
     lines += ["", f"| one camera | {' | '.join(MOVES)} | other images then |", f"|---|{'---|' * (len(MOVES) + 1)}"]
     for name, t in tallies.items():
         if t.moved:

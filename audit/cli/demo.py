@@ -110,8 +110,8 @@ def _comparison(run: RunReader, truth: Sequence[TruthRecord]) -> str:
         *_false_alarms(sound),
         (
             "What no verdict can find: a pose that was adjusted together with its error (it is at its optimum), a "
-            f"misfit below {run.info['config']['min_effect']} (--min-effect), symmetric mis-registration, global "
-            "scale, drift."
+            f"misfit below {run.info['config']['min_effect']} (--min-effect); and without witnesses outside of the "
+            "images (docs/witnesses.md) symmetric mis-registration, global scale, drift."
         ),
     ]
     return "\n".join([table, *(paragraph(line, page.width) for line in lines)])

@@ -262,7 +262,7 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
     FindingCode.POSSIBLE_FOLD: Guidance(
         "Opposite sides of a symmetric building put together; day and night; a loop that was not closed.",
         "Compare with another reconstruction (check --baseline) or ask a database; filter --keep-group keeps a side.",
-        "That the model is folded: one in five right models of real photos looks so.",
+        "That the model is folded: one in four right models of real photos looks so.",
     ),
     FindingCode.REFERENCE_NOT_USED: Guidance(
         "The reference of other images, names that do not fit it, or poses of another body than the camera.",

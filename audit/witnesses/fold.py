@@ -86,7 +86,8 @@ def _findings(found: Fold) -> Iterator[Finding]:
         sizes = [int(np.count_nonzero(found.group == k)) for k in (1, 2)]
         text = (
             f"two groups of {sizes[0]} and {sizes[1]} images (fold_group) stand side by side and have "
-            f"{found.score:.0%} fewer points in common than images so close within a group: folded, or two times of day"
+            f"{found.score:.0%} fewer points in common than images so close within a group: missing matches, "
+            "two times of day, or a fold"
         )
         yield Finding(FindingCode.POSSIBLE_FOLD, sizes[1], text)
 

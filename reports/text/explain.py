@@ -30,7 +30,8 @@ LIMITS: Final = (
     "KS judges the noise, not the camera: a correct camera with odd noise can be rejected, and a wrong lens can pass.",
     (
         "An accepted image agrees with its own reconstruction. That cannot see symmetric mis-registration, a wrong "
-        "global scale, or drift."
+        "global scale, or drift. Another reconstruction of the same photos (check --baseline) sees folds and drift; "
+        "docs/witnesses.md says who sees what, and how often."
     ),
     (
         "A pose that was adjusted together with its error is at its optimum, and a misfit below the effect that "

@@ -64,7 +64,7 @@ CAVEATS: Final = (
     ),
     (
         "An accepted image agrees with its own reconstruction, which cannot see symmetric mis-registration, "
-        "global scale or drift."
+        "global scale or drift; docs/witnesses.md says who can, and how often."
     ),
 )
 

@@ -15,6 +15,7 @@ from scripts.validation.markdown import percent, table
 from scripts.validation.rules import rule_rows
 from scripts.validation.study import HOLDS, VIOLATED, WITHIN_CHANCE, Check
 from scripts.validation.truth import ALPHA, CAMERA_DEFECTS, SIGMA_PX, SOUND, TAU_PX
+from scripts.validation.witnesses import witnesses_section
 from sfm_audit.audit.misfit import GROUPS
 from sfm_audit.audit.simulate.defects import DefectKind
 
@@ -33,6 +34,7 @@ def document(tables: Tables, checks: Sequence[Check | Within], seed: int) -> dic
         _cameras(tables["cameras"]),
         _advice(tables["advice"]),
         _rules(tables["scenes"]),
+        witnesses_section(),
         words.LIMITS,
     ]
     details = [

@@ -189,4 +189,5 @@ LIMITS: Final = """\
   are wrong in several ways at once.
 - The size of a defect is what remains visible to the image's own refit on true points. What all images share and points
   absorb entirely is invisible to any test of residuals.
-- Verdicts rest on one model at a time. A wrong reconstruction that is consistent in itself passes."""
+- Verdicts rest on one model at a time. A wrong reconstruction that is consistent in itself passes, unless a witness
+  outside of it was asked and sees that."""

@@ -19,7 +19,7 @@ from sfm_audit.audit.table.witnesses import (
     WitnessWords,
     wilson_upper,
 )
-from sfm_audit.audit.table.words import REASONS, WITNESS_CODES, Member, Verdict
+from sfm_audit.audit.table.words import REASONS, WITNESS_CODES, Member, Severity, Verdict
 
 SETTINGS = AuditConfig()
 AGREES = WitnessStatement(Witness.PAIRS, 0.0, 0.5, "0 of 8 pairs", 1.0)
@@ -84,6 +84,12 @@ def test_a_witness_may_reject_after_enough_healthy_images_with_hardly_a_false_al
     assert replace(words, num_healthy=381).may_reject
     assert not replace(words, num_healthy=381, num_false_alarms=1).may_reject
     assert replace(words, num_healthy=2000, num_false_alarms=5).may_reject
+
+
+def test_pairs_reject_and_no_other_witness_does_yet():
+    assert [witness for witness in Witness if WITNESSES[witness].may_reject] == [Witness.PAIRS]
+    decision = decide(sound(testimonies=(AGAINST,)), SETTINGS)
+    assert (decision.verdict, decision.severity) == (Verdict.REJECTED, Severity.HARD)
 
 
 @pytest.mark.parametrize(
