@@ -151,6 +151,29 @@ def test_consistency_in_words():
     assert found.text == "all 30 observations lie behind the camera: axes flipped, or poses inverted?"
 
 
+@pytest.mark.parametrize(
+    ("inconsistent", "num_linked", "share_in_front", "is_behind"),
+    [
+        (None, 1, 0.0, True),
+        (None, 19, 0.0, True),
+        (None, 0, 0.0, False),  # nothing is there to lie behind
+        (None, 19, 0.05, False),
+        (None, 19, 1.0, False),
+        (False, 19, 0.0, False),  # the model's other images have an answer
+        (True, 30, 0.0, False),
+    ],
+)
+def test_an_image_with_too_few_points_to_be_inconsistent_says_that_all_lie_behind(
+    inconsistent, num_linked, share_in_front, is_behind
+):
+    image = ImageConsistency("a.jpg", 1, num_linked, share_in_front, inconsistent=inconsistent)
+    found = jointly.consistency_diagnostics(image, all_behind=False)
+    assert found.all_behind is is_behind
+    behind = f"all {num_linked} observations lie behind the camera: axes flipped, or poses inverted?"
+    assert found.text == (behind if is_behind else "")
+    assert jointly.consistency_diagnostics(image, all_behind=True).all_behind
+
+
 def test_gains_are_those_of_the_image():
     joint = SimpleNamespace(gains=[Gains(1.0, 2.0, 3.0), Gains(4.0, 5.0, 6.0)])
     assert jointly.gains_of(joint, 1) == Gains(4.0, 5.0, 6.0)

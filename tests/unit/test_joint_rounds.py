@@ -195,6 +195,22 @@ def test_images_outside_of_the_system_are_not_asked(monkeypatch):
     assert math.isnan(result.effect_px[0])
 
 
+def test_who_is_not_tested_says_why_once_for_all(monkeypatch):
+    """Two without columns, two excluded, the others tested: nothing is significant where nothing was asked."""
+    rounds = Rounds(monkeypatch, [QUIET] * 8, has_columns=[False, True, True, False, True, True, True, True])
+    result = rounds.run(excluded=np.array([False, True, False, True, True, False, False, False]))
+    statuses = [{test.status for test in tests.values()} for tests in result.tests]
+    no_columns, excluded, tested = {S.NO_COLUMNS}, {S.EXCLUDED}, {S.TESTED}
+    assert statuses == [no_columns, excluded, tested, no_columns, excluded, tested, tested, tested]
+    assert result.tests[0] is result.tests[3]
+    assert result.tests[1] is result.tests[4]
+    assert result.tests[2] is not result.tests[5]
+    assert result.cause == (None,) * 8
+    assert np.isnan(result.effect_px).tolist() == [True, True, False, True, True, False, False, False]
+    assert all(math.isnan(test.q) and math.isnan(test.p) for test in result.tests[1].values())
+    assert rounds.num_asked == [0, 0, 1, 0, 0, 1, 1, 1]
+
+
 # one group
 
 
