@@ -21,6 +21,11 @@ Row = Mapping[str, Any]
 
 IMAGE_COLUMNS: Final = (*COLUMNS, "advised_camera_model", "camera_id")
 MAX_ADVISED: Final = 2
+MEASURED_PX: Final = 1e-3
+"""Noise below it is no measurement but the rounding of numbers."""
+NOT_READ: Final = (
+    "Not read: where poses or parts do not hold, or nothing was measured, residuals tell nothing of a lens."
+)
 UNFIT: Final = frozenset({str(DiagnosisCode.PARTS_DISAGREE), str(DiagnosisCode.NOT_MEASURED)})
 """Nothing is refitted where parts do not belong together or nothing was measured."""
 
@@ -62,18 +67,28 @@ def diagnose_model(
     found = evidence(auditor)
     numbers = {**tables, **found}
     said = readings(tables, found)
-    if UNFIT & set(diagnoses) or 2 * tables["rejected_pose"] > tables["images"]:
-        said = ["Not read: where poses or parts do not hold, residuals tell nothing of a lens."]
-    if not refitted:
-        return ModelEvidence(numbers, said, (), (), "Not refitted.")
-    if not auditor.residuals.residuals_px.size:
-        return ModelEvidence(numbers, said, (), (), "Not refitted: no image has an observation to adjust.")
-    if UNFIT & set(diagnoses):
-        return ModelEvidence(numbers, said, (), (), "Not refitted: adjusting says nothing about such a model.")
+    if UNFIT & set(diagnoses) or 2 * tables["rejected_pose"] > tables["images"] or not tables["sigma_px"] > MEASURED_PX:
+        said = [NOT_READ]
+    why_not = "Not refitted." if not refitted else _why_not(auditor, tables, diagnoses, is_wanted=bool(wanted))
+    if why_not is not None:
+        return ModelEvidence(numbers, said, (), (), why_not)
     control = refit(auditor.model, None, auditor.config)
     tried = _refits(auditor, control, tables, wanted or advised(images, cameras), is_wanted=bool(wanted), out=out)
     lines = [refit_reading(tables, control, each) for each in (control, *tried)]
     return ModelEvidence(numbers, said, (control, *tried), lines, conclusion(tables, control, tried))
+
+
+def _why_not(
+    auditor: ModelAuditor, tables: Mapping[str, float], diagnoses: Iterable[str], *, is_wanted: bool
+) -> str | None:
+    """Return why nothing is refitted; None where something is."""
+    if not auditor.residuals.residuals_px.size:
+        return "Not refitted: no image has an observation to adjust."
+    if UNFIT & set(diagnoses):
+        return "Not refitted: adjusting says nothing about such a model."
+    if 2 * tables["rejected_plausible"] > tables["images"] and not is_wanted:
+        return "Not refitted: most cameras are like none; fix their focal lengths first."
+    return None
 
 
 def _refits(

@@ -19,6 +19,7 @@ PERSISTS: Final = 0.5
 CELLS_SHARE: Final = 0.75
 HELPS: Final = 0.5
 """A refit helps if it leaves at most this share of the images that misfit rejects after the control."""
+HOLDS_A_PART: Final = 0.75
 
 
 def readings(tables: Numbers, found: Numbers) -> list[str]:
@@ -52,6 +53,8 @@ def _rolling(tables: Numbers, found: Numbers) -> str:
     own, beyond = tables.get("smooth_px", math.nan), found.get("beyond_rs_px", math.nan)
     if not own > SMALL_PX or math.isnan(beyond):
         return ""
+    if beyond > own:
+        return "Rolling shutter does not explain it: the smooth field stays when the pose may change from row to row."
     numbers = f"{beyond:.2f} of {own:.2f} px smooth field stay when the pose may change from row to row"
     if beyond <= MOSTLY * own:
         return f"Rolling shutter explains most of it: {numbers}."
@@ -94,8 +97,9 @@ def refit_reading(tables: Numbers, control: Refit, tried: Refit) -> str:
     if tried.problem is not None:
         return f"{name}: could not be refitted ({tried.problem})."
     before, after = tables["rejected_misfit"], tried.numbers["rejected_misfit"]
-    fields = f"smooth {tried.numbers['smooth_px']:.2f} px (was {tables['smooth_px']:.2f})"
-    numbers = f"misfit rejects {after:.0f} of {tried.numbers['images']:.0f} (was {before:.0f}), {fields}"
+    numbers = f"misfit rejects {after:.0f} of {tried.numbers['images']:.0f} (was {before:.0f})"
+    if not math.isnan(tried.numbers["smooth_px"] + tables["smooth_px"]):
+        numbers += f", smooth {tried.numbers['smooth_px']:.2f} px (was {tables['smooth_px']:.2f})"
     if tried.camera_model is None or control.problem is not None:
         return f"{name}: {numbers}."
     verdict = "helps" if helps(control, tried) else "does not help beyond adjusting"
@@ -123,10 +127,21 @@ def conclusion(tables: Numbers, control: Refit, tried: Sequence[Refit]) -> str:
         return "No larger camera model of the family can express these cameras; nothing was refitted but the control."
     if control.numbers["rejected_misfit"] == 0:
         return "Adjusting the model as it is leaves no image that misfit rejects: adjust, and keep the camera model."
+    return _best_of(control, tried)
+
+
+def _best_of(control: Refit, tried: Sequence[Refit]) -> str:
+    """Say which refit helps, which at least holds a part, or that none does."""
     helping = [each for each in tried if helps(control, each)]
-    if not helping:
-        return "No refit helps: keep the camera model; what is left is not a lens of COLMAP's."
-    return f"Refit as {helping[0].camera_model}."
+    if helping:
+        return f"Refit as {helping[0].camera_model}."
+    fitted = [each for each in tried if each.problem is None]
+    best = min(fitted, key=lambda each: each.numbers["rejected_misfit"], default=control)
+    left, rejected = best.numbers["rejected_misfit"], control.numbers["rejected_misfit"]
+    if left <= HOLDS_A_PART * rejected:
+        said = f"{best.camera_model} holds a part: misfit rejects {left:.0f} instead of {rejected:.0f}."
+        return f"{said} What is left is not a lens of COLMAP's."
+    return "No refit helps: keep the camera model; what is left is not a lens of COLMAP's."
 
 
 def _adjusting(before: Numbers, control: Refit) -> str:

@@ -17,6 +17,8 @@ _OF_FILES: Final = frozenset(
         *(FindingCode.STORED_ERRORS_ZERO, FindingCode.STORED_ERRORS_MISSING, FindingCode.STORED_ERRORS_STALE),
         *(FindingCode.ORPHAN_CAMERAS, FindingCode.NON_FINITE_UNUSED, FindingCode.STATED_COUNT_DIFFERS),
         *(FindingCode.UNTERMINATED_TEXT, FindingCode.OBSERVATIONS_WITHOUT_IMAGE, FindingCode.DATABASE_NOT_USED),
+        *(FindingCode.REFERENCE_NOT_USED, FindingCode.REFERENCE_SCALE),
+        *(FindingCode.PRIORS_NOT_USED, FindingCode.PRIORS_SCALE),
     }
 )
 """They say something of the files, of points or of unused records; no verdict of an image rests on them."""
@@ -51,6 +53,7 @@ _TOLD_BY_ROW: Final[dict[FindingCode, Callable[[Row], bool]]] = {
     FindingCode.IMPLAUSIBLE_CAMERAS: lambda row: row[Member.PLAUSIBLE] == Verdict.REJECTED,
     FindingCode.IMAGES_DISAGREE: _has_reason(ReasonCode.INCONSISTENT, ReasonCode.POINTS_BEHIND),
     FindingCode.EXACT_PROJECTIONS: _has_reason(ReasonCode.EXACT_PROJECTIONS),
+    FindingCode.REFERENCE_FRAGMENTS: _has_reason(ReasonCode.REFERENCE_DISAGREES),
     FindingCode.POSSIBLE_FOLD: _has_reason(ReasonCode.FOLD_DISAGREES),
 }
 """Finding -> whether the row of an image has what the finding counts."""

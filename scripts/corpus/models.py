@@ -74,6 +74,6 @@ def _name(row: Mapping[Any, Any], count: Mapping[str, int]) -> str:
 
 def _unread(failure: Mapping[str, Any]) -> str:
     """Return what could not be read without the place where the corpus lies on this machine."""
-    location = str(failure["model_path"])
+    location = str(failure["location"])
     name = Path(location).name
     return f"{name}: {str(failure['message']).replace(location, '').lstrip('/: ')}"

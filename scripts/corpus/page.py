@@ -172,7 +172,7 @@ def _actions(models: Sequence[CorpusModel]) -> list[str]:
     for model in models:
         if model.found is None:
             continue
-        said = [*_diagnosis_lines(model.diagnoses), "", *_found_lines(model.found)]
+        said = [*_diagnosis_lines(model.diagnoses), "", "Residuals and refits:", "", *_found_lines(model.found)]
         twin = told.setdefault("\n".join(said), model.name)
         text = said if twin == model.name else [f"The same reconstruction as {twin}, and the same result."]
         out += [f"### {model.name}", "", *text, ""]

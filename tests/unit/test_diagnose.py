@@ -62,6 +62,19 @@ def test_nothing_is_refitted_where_it_would_say_nothing(audited):
     assert found.numbers["rejected_misfit"] == 2
 
 
+def test_no_lens_is_sought_where_most_cameras_are_like_none_or_nothing_was_measured(audited):
+    auditor, tables = audited
+    images, cameras = tables.images.to_pylist(), tables.cameras.to_pylist()
+    odd = [{**row, "plausible": "rejected"} for row in images]
+    found = diagnose_model(auditor, [*odd[:6], *images[6:]], cameras, ["implausible_cameras"])
+    assert (found.refits, found.conclusion[:32]) == ((), "Not refitted: most cameras are l")
+    exact = [{**row, "sigma_constant_px": 1e-6} for row in images]
+    found = diagnose_model(auditor, exact, cameras, ["own_lenses"], refitted=False)
+    assert found.readings == [
+        "Not read: where poses or parts do not hold, or nothing was measured, residuals tell nothing of a lens."
+    ]
+
+
 def test_a_larger_camera_predicts_the_same(bent):
     larger = with_cameras(bent, "OPENCV")
     assert larger is not None
@@ -118,6 +131,13 @@ def test_the_smallest_model_that_helps_is_the_conclusion():
     tables, tried = before(10, 10), [done("RADIAL", 9), done("OPENCV", 1), done("FULL_OPENCV", 0)]
     assert conclusion(tables, control, tried) == "Refit as OPENCV."
     assert conclusion(tables, control, [done("RADIAL", 9), FAILED]).startswith("No refit helps")
+    assert conclusion(tables, control, [FAILED]).startswith("No refit helps")
+    part = [done("RADIAL", 8), done("OPENCV", 7)]
+    assert (
+        conclusion(tables, control, part)
+        == "OPENCV holds a part: misfit rejects 7 instead of 10. What is left is not a lens of COLMAP's."
+    )
+    assert conclusion(tables, control, part[:1]).startswith("No refit helps")
     assert conclusion(tables, done(None, 0), [done("RADIAL", 0)]).startswith("Adjusting the model as it is")
     assert conclusion(tables, control, []).startswith("No larger camera model")
     assert conclusion(tables, FAILED, []) == "It cannot be adjusted (it is odd); repair that first."
@@ -143,6 +163,7 @@ def test_refits_are_read_against_the_control():
     assert "does not help beyond adjusting;" in refit_reading(tables, control, done("RADIAL", 7))
     assert refit_reading(tables, control, FAILED) == "OPENCV: could not be refitted (it is odd)."
     assert "helps" not in refit_reading(tables, FAILED, done("RADIAL", 1))
+    assert refit_reading(tables, control, done(None, 8, smooth=math.nan)) == "as it is: misfit rejects 8 of 10 (was 8)."
 
 
 FOUND = {
@@ -164,6 +185,7 @@ FOUND = {
         ({"common_radial_px": 0.21}, ("A common part", "Rolling shutter alone does not")),
         ({"common_smooth_px": math.nan, "beyond_rs_px": 0.2}, ("Rolling shutter explains most",)),
         ({"by_cells": 0.5}, ("Different", "Rolling", "Part of the significance")),
+        ({"beyond_rs_px": 0.5}, ("Different", "Rolling shutter does not explain it: the smooth field stays")),
         ({"neighbours": 0.2}, ("Different", "Rolling", "Neighbouring points")),
         ({"persistence": 0.5}, ("Different", "Rolling", "A point keeps its error")),
         ({"neighbours": math.nan, "persistence": math.nan, "by_cells": math.nan}, ("Different", "Rolling")),

@@ -118,6 +118,7 @@ def found(code, count=1, text="what was found"):
         (FindingCode.IMAGES_DISAGREE, {"reasons": ["inconsistent: 9 px"]}, {"reasons": None}),
         (FindingCode.IMAGES_DISAGREE, {"reasons": ["points_behind: 8 of 9"]}, {"reasons": []}),
         (FindingCode.EXACT_PROJECTIONS, {"reasons": ["exact_projections: 0 px"]}, {"reasons": []}),
+        (FindingCode.REFERENCE_FRAGMENTS, {"reasons": ["reference_disagrees: 3 m"]}, {"reasons": []}),
         (FindingCode.POSSIBLE_FOLD, {"reasons": ["fold_disagrees: 0.9"]}, {"reasons": []}),
     ],
 )
@@ -134,6 +135,7 @@ def test_a_finding_that_only_counts_concerns_an_image_where_it_counts_all(code):
 
 def test_findings_of_the_model_and_of_a_later_version_concern_every_image_those_of_files_none():
     findings = [found("rounded_poses"), found("stored_errors_stale"), found("of_a_later_version")]
+    findings.append(found("reference_scale"))
     assert findings_about(row(), findings, 5) == [findings[0], findings[2]]
 
 
