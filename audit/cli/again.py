@@ -20,6 +20,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.rejections import REJECTING_CODES, CountedRejections, counted, verdict_counts
 from sfm_audit.audit.decision.triage import CAMERA_COLUMNS, IMAGE_COLUMNS, triage
 from sfm_audit.audit.table.words import POLICIES, ReasonCode, Severity
+from sfm_audit.loaders.model import FindingCode
 from sfm_audit.reports.run_folder.reader import RunReader
 
 AGAIN_OPTIONS: Final = ("policy", "min_effect", "reasons", "at_least")
@@ -197,7 +198,8 @@ class _Decided:
             return models
         rows = images.select(list(IMAGE_COLUMNS)).to_pylist(), cameras.select(list(CAMERA_COLUMNS)).to_pylist()
         found = [
-            [asdict(each) for each in triage(*rows, str(path))] for path in models.column("model_path").to_pylist()
+            [asdict(each) for each in triage(*rows, str(row["model_path"]), parts_disagree=_is_torn(row["findings"]))]
+            for row in models.select(["model_path", "findings"]).to_pylist()
         ]
         at = models.column_names.index("diagnoses")
         kind = models.schema.field(at)
@@ -219,3 +221,7 @@ def _with_counts(models: pa.Table, counts: Mapping[str, int]) -> pa.Table:
             kind = models.schema.field(at)
             models = models.set_column(at, kind, pa.array([count] * models.num_rows, type=kind.type))
     return models
+
+
+def _is_torn(findings: Iterable[Mapping[str, Any]] | None) -> bool:
+    return any(finding["code"] == FindingCode.PARTS_DISAGREE for finding in findings or ())

@@ -43,12 +43,15 @@ _STEPS: Final = (ReasonCode.POSE_NOT_OPTIMAL, ReasonCode.CAMERA_NOT_OPTIMAL)
 _ORDER: Final = {code: rank for rank, code in enumerate(DiagnosisCode)}
 
 
-def triage(images: Sequence[Row], cameras: Iterable[Row], model_path: str) -> list[Diagnosis]:
+def triage(
+    images: Sequence[Row], cameras: Iterable[Row], model_path: str, *, parts_disagree: bool = False
+) -> list[Diagnosis]:
     """Return the diagnoses of a model, the most urgent first; elements of the column ``diagnoses`` of the models table.
 
     Parameters
     ----------
     images, cameras : rows with ``IMAGE_COLUMNS``, ``CAMERA_COLUMNS``            model_path : for the commands to copy
+    parts_disagree : the model has this finding: every rejection is about that, whatever its reasons are
 
     Notes
     -----
@@ -59,6 +62,8 @@ def triage(images: Sequence[Row], cameras: Iterable[Row], model_path: str) -> li
     groups: dict[_Key, list[Row]] = {}
     for row in images:
         code = _code_of(row, by_id.get(row["camera_id"]))
+        if parts_disagree and row["verdict"] == Verdict.REJECTED:
+            code = DiagnosisCode.PARTS_DISAGREE
         if code is not None:
             groups.setdefault(_key(code, row, by_id), []).append(row)
     if not groups:

@@ -55,6 +55,11 @@ def residual_findings(
     return [finding for finding in found if finding is not None]
 
 
+def parts_disagree(findings: Sequence[Finding]) -> bool:
+    """Whether one of the findings says that the parts of the model do not belong together."""
+    return any(finding.code is FindingCode.PARTS_DISAGREE for finding in findings)
+
+
 def pose_findings(model: SparseModel) -> list[Finding]:
     """Return that the stored poses are rounded, and what that is worth in px."""
     quaternions, translations = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world

@@ -17,7 +17,13 @@ from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
 from sfm_audit.audit.decision.triage import triage
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
-from sfm_audit.audit.engine.findings import consistency_findings, joint_findings, pose_findings, residual_findings
+from sfm_audit.audit.engine.findings import (
+    consistency_findings,
+    joint_findings,
+    parts_disagree,
+    pose_findings,
+    residual_findings,
+)
 from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, audit_images, camera_diagnostics
 from sfm_audit.audit.engine.jointly import (
     consistency_diagnostics,
@@ -339,7 +345,7 @@ class ModelAuditor:
         cameras = [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]
         asked = self.outside.witnesses
         row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions, asked)
-        row["diagnoses"] = triage(rows, cameras, labels.model_path)
+        row["diagnoses"] = triage(rows, cameras, labels.model_path, parts_disagree=parts_disagree(findings))
         return ModelAudit(
             images_table(rows, self.config.column_groups),
             table_of("cameras", cameras),

@@ -77,6 +77,19 @@ def test_every_diagnosis_is_reached_and_has_words():
     assert {code for *_, code in BRANCHES} == set(DiagnosisCode) == set(DIAGNOSES)
 
 
+def test_where_parts_disagree_every_rejection_is_about_that_and_nothing_else_is():
+    rows = [
+        image("a", "pose_not_optimal: 300"),
+        image("b", RADIAL),
+        image("c", "low_coverage: 1", verdict="undetermined"),
+        image("d", verdict="accepted"),
+    ]
+    found = triage(rows, [ONE], "m", parts_disagree=True)
+    assert [(each.code, each.num_images) for each in found] == [("parts_disagree", 2), ("too_little", 1)]
+    assert "parts_disagree" not in {each.code for each in triage(rows, [ONE], "m")}
+    assert [each.code for each in triage(rows[3:], [ONE], "m", parts_disagree=True)] == ["sound"]
+
+
 def test_a_rejection_that_does_not_count_has_no_diagnosis():
     assert triage([image("a", RADIAL, verdict="undetermined")], [ONE], "m") == []
     assert triage([], [], "m") == []
