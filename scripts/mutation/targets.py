@@ -35,6 +35,8 @@ TARGETS: Final = (
         DECISION,
         ("decide_misfit", "is_worth_nothing", "named_cause", "MisfitDecision.largest_px", "_SHIFTS", "_SAYS_NOTHING"),
     ),
+    Target("reports/compare/pose_limits.py", ("unit/test_pose_limits.py",), ("pose_limits", "PoseLimit.passed")),
+    Target("reports/export/selection.py", ("unit/test_pose_limits.py",), ("known_to",)),
     Target("audit/decision/rejections.py", ("unit/test_rejections.py",)),
     Target("audit/decision/triage.py", ("unit/test_decision_triage.py",)),
     Target("audit/decision/severity.py", DECISION, ("severity_of", "worth_of", "worth_severity", "_ALWAYS_HARD")),

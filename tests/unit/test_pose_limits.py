@@ -34,9 +34,7 @@ def kept(*options: str) -> list[str]:
 
 
 def test_filter_keeps_poses_that_are_known_so_well():
-    write_run(
-        Path("RUN"), {"a": rejected(known([0.05, 0.1, 0.11, np.nan, 0.01], [0.001, 0.02, 0.001, 0.001, 0.01]), 4)}
-    )
+    write_run(Path("RUN"), {"a": rejected(known([0.05, 0.1, 0.11, np.nan, 0.5], [0.001, 0.02, 0.001, 0.001, 0.01]), 4)})
     assert kept() == ["0", "1", "2", "3"]
     assert kept("--max-rotation-sd", "0.1") == ["0", "1"]
     assert kept("--max-centre-sd", "0.01") == ["0", "2", "3"]
@@ -45,6 +43,7 @@ def test_filter_keeps_poses_that_are_known_so_well():
     assert "sd_centre: 0.02 > 0.01" in removed
     assert "sd_rotation_deg: 0.11 > 0.1" in removed
     assert "sd_rotation_deg: not known" in removed
+    assert "ks_rejected: p = 0.01; sd_rotation_deg: 0.5 > 0.1" in removed
 
 
 def test_filter_says_where_a_run_knows_nothing_of_its_poses(capsys):
@@ -79,6 +78,7 @@ def test_gates_limit_the_worst_of_the_accepted_images(limits, passes):
     for text in (f"[limits]\n{limits}", f'[[scene]]\nmatch = "a"\n[scene.limits]\n{limits}'):
         (check,) = checks(columns, text)
         assert check.passed == passes
+        assert check.value == (0.2 if "rotation" in limits else 0.02)
         assert len(check.images) == (0 if passes else 1)
         assert check.name == f"limits.{limits.split(' =')[0]}"
 
