@@ -36,6 +36,7 @@ _COVARIANCE: Final = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"
 _UPPER: Final = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _MAX_ALTITUDE_M: Final = 1e7
 _MAX_COORDINATE: Final = 1e12
+_NAMES_SHOWN: Final = (8, 20)  # of a header that is none: so many names, so many characters of each
 
 
 def priors_of(model: SparseModel, priors: str, shown_as: str) -> PositionPriors | NotAsked:
@@ -130,7 +131,9 @@ def _read_csv(path: InputPath) -> tuple[StoredPriors, bool]:
     header = [cell.strip().lower() for cell in _cells(file, *lines[0])]
     axes = next((axes for axes in (_CARTESIAN, _GEODETIC) if set(axes) <= set(header)), None)
     if "name" not in header or axes is None or len(set(header)) != len(header):
-        raise file.malformed(lines[0][0], "the columns name and x, y, z, or name and lat, lon, alt", str(header))
+        count, length = _NAMES_SHOWN
+        got = f"{len(header)}: {', '.join(repr(cell[:length]) for cell in header[:count])}"
+        raise file.malformed(lines[0][0], "the columns name and x, y, z, or name and lat, lon, alt", got)
     sds = next((each for each in (_COVARIANCE, _SDS, ("sd",)) if set(each) <= set(header)), ())
     if len(lines) > MAX_POSES:
         raise file.malformed(lines[MAX_POSES][0], f"at most {MAX_POSES} priors", "more")

@@ -178,6 +178,13 @@ def test_what_is_wrong_with_a_csv_is_said(tmp_path, text, what):
         read_priors(csv(tmp_path, text))
 
 
+@pytest.mark.parametrize("text", ["name" + ",x" * 100_000 + "\n", "[" * 100_000 + "\n"])
+def test_a_head_of_many_columns_or_one_long_one_is_a_short_line(tmp_path, text):
+    with pytest.raises(LoadError, match=r"found (100001|1): '") as caught:
+        read_priors(csv(tmp_path, text))
+    assert len(str(caught.value).removeprefix(str(tmp_path))) < 400
+
+
 def test_cut_anywhere_a_database_is_refused_or_whole(tmp_path, model):
     content = write_database(tmp_path / "d.db").read_bytes()
     path = tmp_path / "cut.db"
