@@ -26,7 +26,7 @@ from typing import Final
 if __package__ in (None, ""):  # called by its path
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from scripts.bench_audit import SINGLE_THREADED, peak_bytes, simulate
+from scripts.bench import SINGLE_THREADED, peak_bytes, simulate
 
 HERE: Final = Path(__file__).resolve()
 ITERATIONS: Final = 3

@@ -26,11 +26,13 @@ def main() -> None:
     parser.add_argument("--observations", type=int, default=2000, help="linked keypoints per image")
     parser.add_argument("--keypoints", type=int, default=8000, help="keypoints per image, linked or not")
     parser.add_argument("--sigma", type=float, default=0.5, help="px per axis, one lognormal value per track")
+    parser.add_argument("--shared", action="store_true", help="one camera for all images")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     spec = SceneSpec(
         num_images=args.images,
         points_per_image=args.observations,
+        shared_camera=args.shared,
         unlinked_per_image=max(0, args.keypoints - args.observations),
         noise=NoiseSpec(NoiseKind.PER_TRACK_LOGNORMAL, sigma_px=args.sigma),
         track_decay=_TRACK_DECAY,

@@ -132,7 +132,7 @@ def points(folder: Path, quick: bool) -> Measured:
 
 def images(folder: Path, quick: bool) -> Measured:
     """A hundred thousand images with 5 points: what an image costs that cannot be tested."""
-    num = 2_000 if quick else 100_000
+    num = 2_500 if quick else 100_000  # more than the pairs of all images are compared of
     _written(folder, num_groups=num // 5, num_points=5, track_length=5)
     _audit(writer.write_binary(folder / "warm", writer.noisy_model()))
     start, before = time.process_time(), _peak()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -25,11 +25,12 @@ from sfm_audit.audit.decision.diagnostics import (
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.engine.camera import image_advice
 from sfm_audit.audit.inliers.projected import inliers_of
-from sfm_audit.audit.inliers.residuals import image_residuals, longest_px
+from sfm_audit.audit.inliers.residuals import ModelResiduals, image_residuals, longest_px
 from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.audit.misfit import Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
-from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
+from sfm_audit.audit.noise.stack import constant_noises, track_noises
+from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise
 from sfm_audit.audit.normality import NormalityTests, normality_tests, normality_tests_of
 from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
@@ -189,17 +190,41 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
     return audit_image(evidence, config)
 
 
-def audit_images(images: Iterable[ImageEvidence], config: AuditConfig) -> Iterator[ImageAudit]:
-    """Audit images one after the other; those with few observations are tested together, some at once."""
+KnownOf = Callable[[int, ImageNoise | None, ImageNoise | None], ImageEvidence]
+"""Given an image's row, its noise of one scale and under the chosen noise model, each None where not at hand."""
+
+
+def audit_images(
+    known: KnownOf, image_idxs: range, residuals: ModelResiduals, tracks: ModelTracks | None, config: AuditConfig
+) -> Iterator[ImageAudit]:
+    """Audit some images of a model; those with few observations are fitted and tested together, some at once.
+
+    Parameters
+    ----------
+    known : what is known of an image        tracks : where the chosen noise model is ``track``, else None
+    """
     waiting: list[ImageEvidence] = []
     num_values = 0
-    for evidence in images:
+    for evidence in _evidence_of(known, image_idxs, residuals, tracks):
         waiting.append(evidence)
         num_values += evidence.constant.z.size
         if num_values > _MAX_VALUES_AT_ONCE or len(waiting) == _MAX_IMAGES_AT_ONCE:
             yield from _audited_together(waiting, config)
             waiting, num_values = [], 0
     yield from _audited_together(waiting, config)
+
+
+def _evidence_of(
+    known: KnownOf, image_idxs: range, residuals: ModelResiduals, tracks: ModelTracks | None
+) -> Iterator[ImageEvidence]:
+    """Yield what is known of each image; the noise of those with few observations is fitted together."""
+    for start in range(0, len(image_idxs), _MAX_IMAGES_AT_ONCE):
+        part = image_idxs[start : start + _MAX_IMAGES_AT_ONCE]
+        constant = constant_noises(residuals, part)
+        sigma_px = {image: noise.sigma_constant_px for image, noise in constant.items()}
+        chosen = {} if tracks is None else track_noises(tracks, part, sigma_px)
+        for image in part:
+            yield known(image, constant.get(image), chosen.get(image))
 
 
 def _audited_together(images: Sequence[ImageEvidence], config: AuditConfig) -> Iterator[ImageAudit]:

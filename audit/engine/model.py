@@ -241,25 +241,26 @@ class ModelAuditor:
 
     def inliers(self, image: int | str) -> InlierSet:
         """Return the 2D-3D inliers of an image, given its row, its name or ``id:<image_id>``."""
-        image_idx = self.model.image_idx(image) if isinstance(image, str) else image
-        return inlier_set(self.model, self.residuals, image_idx)
+        return inlier_set(self.model, self.residuals, self.model.image_idx(image) if isinstance(image, str) else image)
 
     def image(self, image: int | str) -> ImageAudit:
         """Audit one image within its model, given its row, its name or ``id:<image_id>``."""
         image_idx = self.model.image_idx(image) if isinstance(image, str) else image
         return audit_image(self.evidence(image_idx), self.config)
 
-    def evidence(self, image_idx: int) -> ImageEvidence:
-        """Return what is known of the image in row ``image_idx`` before anything is decided."""
+    def evidence(
+        self, image_idx: int, constant: ImageNoise | None = None, chosen: ImageNoise | None = None
+    ) -> ImageEvidence:
+        """Return what is known of an image before anything is decided, given its row; its noise where at hand."""
         rows = self.residuals.rows(image_idx)
         residuals_px = self.residuals.residuals_px[:, rows]
-        constant = constant_noise(residuals_px)
+        constant = constant or constant_noise(residuals_px)
         return ImageEvidence(
             self.inliers(image_idx),
             residuals_px,
             float(self.residuals.pose_offset_px[image_idx]),
             constant,
-            self._noise(image_idx, constant),
+            chosen or self._noise(image_idx, constant),
             track_length=self.tracks.statistics.track_length[rows],
             quality=self.quality[image_idx],
             misfit=self.misfit(image_idx),
@@ -334,11 +335,10 @@ class ModelAuditor:
     def tables(self, labels: ModelLabels | None = None, *, observations: bool = False) -> ModelAudit:
         """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
         labels = labels or self._own_labels
-        shared = self.joint, self.cameras, self.tracks, self.config.noise == "keypoint" and self.keypoint_tracks
-        _ = shared, self.outside  # before the images are spread
+        _ = self.joint, self.cameras, self.tracks, self.outside  # before the images are spread
+        _ = self.config.noise == "keypoint" and self.keypoint_tracks
         images = self._spread(partial(_images_of, labels=labels), self)
-        rows = [row for row, _ in images]
-        decisions = [decision for _, decision in images]
+        rows, decisions = [row for row, _ in images], [decision for _, decision in images]
         own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
@@ -394,5 +394,6 @@ def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality 
 
 def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:
     """Rows of the image table and decisions about some images."""
-    audits = audit_images(map(auditor.evidence, image_idxs), auditor.config)
+    tracks = auditor.tracks if auditor.config.noise == "track" else None
+    audits = audit_images(auditor.evidence, image_idxs, auditor.residuals, tracks, auditor.config)
     return [(image_row(audit, labels, auditor.config.noise), audit.decision) for audit in audits]

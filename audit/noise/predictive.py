@@ -346,6 +346,11 @@ class TrackStandardiser:
             log_f = _inside(log_f, step, low, high)
         return StandardisedImage(z, math.exp(log_f), converged=False)
 
+    def transform_stack(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+        """Return z (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m) = nu_values[nu_row]."""
+        flat = np.ascontiguousarray(t.transpose(1, 0, 2)).reshape(2, -1)
+        return self._transform(flat, nu_row.reshape(-1), nu.reshape(-1)).reshape(*nu.shape, 2)
+
     def _transform(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
         z = np.empty((t.shape[1], 2))
         z[:, 0] = self.first(t[0], nu_row, nu)

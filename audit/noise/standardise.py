@@ -13,7 +13,7 @@ from sfm_audit.audit.noise.predictive import TrackPrior, TrackStandardiser, fit_
 from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
-_A_SQ_QUANTILE = 0.99  # predictors above it count as if they were there, in the paper's form (1) only
+PREDICTOR_QUANTILE = 0.99  # predictors above it count as if they were there, in the paper's form (1) only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +143,7 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
         return ImageNoise(empty, sigma_constant_px, math.nan, math.nan, math.nan, math.nan, converged=False)
     standardised = tracks.standardiser.standardise(whitened, own)
     predictor = statistics.other_sq_px2[rows][verified] / statistics.other_dof[rows][verified]  # a_k^2 of (3)
-    predictor = np.minimum(predictor, _quantile(predictor, _A_SQ_QUANTILE))
+    predictor = np.minimum(predictor, _quantile(predictor, PREDICTOR_QUANTILE))
     paper = fit_variance(whitened**2, predictor)
     factor = standardised.factor
     return ImageNoise(

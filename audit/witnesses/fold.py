@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import eigh
 
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
@@ -33,6 +34,8 @@ MIN_MIXED: Final = 0.7
 _MIN_GROUP: Final = 3
 _MIN_EITHER: Final = 8  # points that either of two images sees and both should
 _NUM_SPLITS: Final = 3
+_FULL_BELOW: Final = 20.0  # entries of a full matrix per product of a sparse one
+_FULL_AT_ONCE: Final = 1 << 21  # numbers: 16 MB
 _STEP_DEG: Final = 1.0  # pairs are compared with pairs of the same angle
 _MIN_PAIRS: Final = 4  # in such a step, in either group, and half as many across
 
@@ -107,13 +110,30 @@ def _splits(seen: ShouldSee) -> Iterator[BoolArray]:
     num = np.bincount(seen.point, minlength=seen.num_points)
     rate = np.bincount(seen.point, seen.sees, minlength=seen.num_points) / np.maximum(num, 1)
     rest = seen.matrix(seen.sees - rate[seen.point])
-    together = (rest.T @ rest).toarray()
+    together = crossed(rest, rest)
     size = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
     together /= size[:, None] * size
     np.fill_diagonal(together, 0.0)
     vectors = _leading(together)
     for k in range(vectors.shape[1]):
         yield vectors[:, k] > 0
+
+
+def crossed(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
+    """Return left^T right (I, I) of two (P, I).
+
+    As full matrices, some points at a time, where images that all look at the same place fill them: a sparse product
+    costs as much as a hundred products of a full one.
+    """
+    num_points, num_images = left.shape
+    num_products = float(np.diff(left.indptr).astype(np.float64) @ np.diff(right.indptr))
+    if num_points * float(num_images) ** 2 > _FULL_BELOW * num_products:
+        return np.asarray((left.T @ right).toarray())
+    out = np.zeros((num_images, num_images))
+    step = max(1, _FULL_AT_ONCE // max(num_images, 1))
+    for start in range(0, num_points, step):
+        out += left[start : start + step].toarray().T @ right[start : start + step].toarray()
+    return out
 
 
 def _leading(symmetric: FloatArray) -> FloatArray:
@@ -126,13 +146,13 @@ def _leading(symmetric: FloatArray) -> FloatArray:
 def _close_pairs(seen: ShouldSee) -> _ClosePairs:
     """Compare all pairs of images over the points that both should see."""
     should, sees = seen.matrix(np.ones(len(seen.point))), seen.matrix(seen.sees)
-    both = (sees.T @ sees).toarray()
-    half = (sees.T @ should).toarray()
+    both = crossed(sees, sees)
+    half = crossed(sees, should)
     either = half + half.T - both
-    num = np.maximum((should.T @ should).toarray(), 1.0)
+    num = np.maximum(crossed(should, should), 1.0)
     rays = [seen.matrix(seen.ray[k]) for k in range(3)]
-    cosine = np.sum([(ray.T @ ray).toarray() for ray in rays], axis=0) / num
-    logs = (seen.matrix(np.log(seen.distance)).T @ should).toarray()
+    cosine = np.sum([crossed(ray, ray) for ray in rays], axis=0) / num
+    logs = crossed(seen.matrix(np.log(seen.distance)), should)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     close = (either >= _MIN_EITHER) & (angle < MAX_ANGLE_DEG)
     close &= np.abs(logs - logs.T) < np.log(MAX_DISTANCE_RATIO) * num

@@ -126,15 +126,16 @@ def _of_image(
     which = np.repeat(np.arange(len(point)), count)
     starts = np.cumsum(count) - count
     row = np.arange(len(which)) - np.repeat(starts - seen.offsets[point], count)
-    own, cosine = distance.take(which), np.zeros(len(which))
-    for axis in range(3):
-        cosine += seen.ray[axis].take(row) * ray[axis].take(which)
-    there = seen.distance.take(row)
-    near = (cosine > _MIN_COSINE) & (own < MAX_DISTANCE_RATIO * there) & (own * MAX_DISTANCE_RATIO > there)
     sees = np.zeros(len(point), dtype=np.bool_)
     sees[which[seen.image.take(row) == image_idx]] = True
+    own, there = distance.take(which), seen.distance.take(row)
+    asked = np.flatnonzero((own < MAX_DISTANCE_RATIO * there) & (own * MAX_DISTANCE_RATIO > there) & ~sees.take(which))
+    which, row = which[asked], row[asked]
+    cosine = np.zeros(len(which))
+    for axis in range(3):
+        cosine += seen.ray[axis].take(row) * ray[axis].take(which)
     should = sees.copy()
-    should[which[near]] = True
+    should[which[cosine > _MIN_COSINE]] = True
     kept = np.flatnonzero(should)
     image = np.full(len(kept), image_idx)
     return point[kept], image, sees[kept], ray.take(kept, axis=1), distance[kept]

@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gate_samples import scene, write_run
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.cli.main import main
 from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.witnesses import fold
 from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.audit.witnesses.fold import MIN_SCORE, ask_fold, find_fold
 from sfm_audit.audit.witnesses.should_see import should_see
@@ -145,3 +147,12 @@ def test_filter_keeps_one_side(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert main(["filter", "NONE", "--keep-group", "1", "--list", "none.txt"]) == 2
     assert "holds no fold_group" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("share", [0.02, 0.9])
+def test_full_and_sparse_products_are_the_same(share, monkeypatch):
+    rng = np.random.default_rng(0)
+    left, right = (sparse.csr_array(rng.normal(size=(300, 40)) * (rng.random((300, 40)) < share)) for _ in range(2))
+    expected = (left.T @ right).toarray()
+    monkeypatch.setattr(fold, "_FULL_AT_ONCE", 4000)  # several parts
+    np.testing.assert_allclose(fold.crossed(left, right), expected, atol=1e-12)
