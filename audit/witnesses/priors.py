@@ -126,7 +126,7 @@ def hotelling_p(found: PositionAlignment, degrees: float) -> FloatArray:
     of freedom; one outside by that of all, T^2 = d^2 with v; T^2 (m - 2) / (3 m) ~ F(3, m - 2) with m of them.
     """
     with np.errstate(all="ignore"):
-        without = np.where(found.chi2 < degrees, found.chi2 * (degrees - 1) / (degrees - found.chi2), np.inf)
+        without = found.chi2 * (degrees - 1) / np.maximum(degrees - found.chi2, 0.0)
         distance = np.where(found.fitted, without, found.chi2)
         m = np.where(found.fitted, degrees - 1, degrees)
         p: FloatArray = fdtrc(_DEGREES, m - 2, distance * (m - 2) / (_DEGREES * m))

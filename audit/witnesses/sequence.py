@@ -20,14 +20,14 @@ def smoothness_p(errors: FloatArray) -> float:
     sum |e_i+1 - e_i|^2 / sum |e_i - mean|^2 has mean 2 and variance 4 (n - 2) / (n^2 - 1) per coordinate (von Neumann
     1941); over k coordinates of equal size the variance falls by k. Small: errors are smooth.
     """
-    n, k = errors.shape
+    n = len(errors)
     centred = errors - errors.mean(axis=0)
     total = float((centred**2).sum())
     if n < 4 or not total > 0:
         return 1.0
     ratio = float((np.diff(errors, axis=0) ** 2).sum()) / total
     weights = (centred**2).sum(axis=0) / total
-    sd = np.sqrt(4.0 * (n - 2) / (n * n - 1) * float((weights**2).sum())) if k else np.inf
+    sd = np.sqrt(4.0 * (n - 2) / (n * n - 1) * float((weights**2).sum()))
     return float(ndtr((ratio - 2.0) / sd))
 
 

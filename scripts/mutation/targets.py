@@ -12,6 +12,8 @@ LIMITS: Final = ("unit/test_consistency_limits.py", "unit/test_consistency.py")
 ROUNDS: Final = ("unit/test_joint_rounds.py",)
 NO_SCALE: Final = ("unit/test_keypoint_scale_noise.py::test_too_few_tracks_are_not_fitted",)
 
+_REFERENCE: Final = "unit/test_witness_reference.py"
+
 TARGETS: Final = (
     Target(
         "audit/decision/decide.py",
@@ -25,6 +27,12 @@ TARGETS: Final = (
     ),
     Target("audit/decision/outside.py", ("unit/test_decision_outside.py",)),
     Target("audit/witnesses/pairs.py", ("unit/test_witness_pairs.py",), ("contradiction_p", "_statement")),
+    Target("audit/witnesses/reference.py", (f"{_REFERENCE}::test_the_larger_share_of_a_limit_counts",), ("statement",)),
+    Target(
+        "audit/witnesses/priors.py",
+        ("unit/test_prior_laws.py",),
+        ("_by_covariance", "hotelling_p", "prior_p", "spread_p", "_statement"),
+    ),
     Target(
         "audit/table/witnesses.py",
         ("unit/test_decision_outside.py",),

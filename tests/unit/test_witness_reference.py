@@ -171,4 +171,6 @@ def test_smoothness_is_von_neumann_s_ratio():
     assert shared_rms(errors) == pytest.approx(np.sqrt((10 - 2) / 5))
     assert smoothness_p(errors) == pytest.approx(0.0118258, rel=1e-4)  # ratio 0.4, sd sqrt(4 * 3 / 24): z = -2.2627
     assert smoothness_p(errors[:3]) == 1.0
+    assert smoothness_p(errors[:4]) < 0.1
+    assert smoothness_p(np.ones((6, 2))) == 1.0
     assert LEVEL < 0.05
