@@ -47,7 +47,8 @@ def normality_tests_of(samples: Sequence[FloatArray]) -> list[NormalityTests]:
             part = members[start : start + step]
             stack = np.stack([samples[k] for k in part])
             usual = np.flatnonzero(_is_usual(stack))
-            out.update(zip([part[i] for i in usual.tolist()], _tests_of_stack(stack[usual]), strict=True))
+            if usual.size:
+                out.update(zip([part[i] for i in usual.tolist()], _tests_of_stack(stack[usual]), strict=True))
     return [out[k] if k in out else normality_tests(z) for k, z in enumerate(samples)]
 
 

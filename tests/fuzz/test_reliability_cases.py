@@ -9,10 +9,14 @@ import sys
 import time
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 from corpus import CORPUS
 
+from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.loaders import LoadError, discover, open_model
+from sfm_audit.loaders.colmap.database import read_keypoint_scales
 
 CASES = CORPUS.parent / "cases" / "reliability"
 IS_THERE = CASES.is_dir()
@@ -82,6 +86,31 @@ def test_pickles_are_refused_at_once(tmp_path: Path):
             read_scene_info(tmp_path / name)
         assert time.process_time() - start < 3.0, name
         assert "\n" not in str(error.value)
+
+
+SHAPES = ("one_pixel", "one_xyz", "0_points", "1_point", "3_points", "same_names", "focal_1e-3", "focal_1e7")
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_odd_shapes_have_verdicts_and_finite_numbers(tmp_path: Path, kind: str):
+    subprocess.run([sys.executable, CASES / "shapes.py", kind, tmp_path / "m"], check=True)
+    tables = audit_model(open_model(tmp_path / "m"))
+    assert len(tables.images) == 5
+    rows = zip(tables.images["verdict"].to_pylist(), tables.images["reasons"].to_pylist(), strict=True)
+    assert all(reasons for verdict, reasons in rows if verdict != "accepted")
+    for table in (tables.images, tables.cameras, tables.models):
+        for name, column in zip(table.column_names, table.columns, strict=True):
+            if pa.types.is_floating(column.type):
+                assert pc.all(pc.is_finite(column.drop_null())).as_py() is not False, name
+
+
+@pytest.mark.parametrize("kind", ["recursive_view", "two_rows"])
+def test_a_hostile_database_is_one_line(tmp_path: Path, kind: str):
+    subprocess.run([sys.executable, CASES / "sqlite_bombs.py", kind, tmp_path / "m"], check=True)
+    with pytest.raises(LoadError) as error:
+        read_keypoint_scales(open_model(tmp_path / "m"), str(tmp_path / "m"))
+    assert "\n" not in str(error.value)
+    assert str(tmp_path / "m") in str(error.value)
 
 
 def test_all_of_them_are_found_as_models():

@@ -39,6 +39,13 @@ def test_samples_that_are_no_samples_are_left_to_the_single_test():
     assert_same([*z, *np.random.default_rng(2).standard_normal((7, 11, 2)), np.empty((0, 2))])
 
 
+@pytest.mark.parametrize("num_points", [1, 5])
+@pytest.mark.parametrize("value", [0.0, 0.5, math.nan, math.inf])
+def test_none_of_one_size_is_a_sample(num_points, value):
+    """Images that all see one point, exactly where it was projected."""
+    assert_same([np.full((num_points, 2), value) for _ in range(8)])
+
+
 def test_what_lies_on_a_line_is_normal_for_shapiro_and_wilk():
     assert_same([np.linspace(-1.0 - k, 1.0, 10).reshape(5, 2) for k in range(6)])
     assert_same([np.repeat([[0.0, 1.0]], 5, axis=0) + k for k in range(6)])  # two values only
