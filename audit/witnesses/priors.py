@@ -59,6 +59,11 @@ def ask_priors(evidence: Evidence) -> WitnessReport | None:
         needed = f"{MIN_POSITIONS} are needed, {_NEEDED} without covariances, that lie apart"
         reason = f"{len(rows)} images have a prior; {needed}"
         return _silent(evidence.model, f"{priors.location}: {reason}")
+    if not judged.reach > MAX_PRIOR_CHI2:
+        reason = (
+            "its positions scatter as widely about the cameras as these lie apart: its columns, unit or names differ"
+        )
+        return _silent(evidence.model, f"{priors.location}: {reason}, or it says nothing of so small a place")
     return _report(evidence.model, priors, rows, judged)
 
 
@@ -72,12 +77,15 @@ class _Judged:
     """Priors beside the model. alignment: as of `align_positions`.    p: (n,) of each, chi2: (n,) equal to it.
 
     spread: of the priors in units of their covariances; NaN where these were not said.    sd_scale: of the scale.
+    reach: median squared distance of the positions from their middle, in units of how they scatter about the cameras:
+    what a camera would show that is wrong by as much as cameras lie apart.
     """
 
     alignment: PositionAlignment
     p: FloatArray
     spread: float
     sd_scale: float
+    reach: float
 
     @property
     def chi2(self) -> FloatArray:
@@ -90,14 +98,19 @@ def _judged(centre: FloatArray, position: FloatArray, covariance: FloatArray) ->
     """Align, and judge by the covariances, or by the scatter where one of them is not known."""
     if np.isfinite(covariance).all():
         found = align_positions(centre, position, covariance)
-        return None if found is None else _by_covariance(found)
+        return None if found is None else _by_covariance(found, position, covariance)
     return _by_scatter(centre, position)
 
 
-def _by_covariance(found: PositionAlignment) -> _Judged:
+def _by_covariance(found: PositionAlignment, position: FloatArray, covariance: FloatArray) -> _Judged:
     spread = max(found.spread, 1.0)
     p = spread_p(found.chi2 / spread**2, len(found.chi2)) if spread > 1.0 else prior_p(found.chi2)
-    return _Judged(found, p, found.spread, found.sd_scale * spread)
+    return _Judged(found, p, found.spread, found.sd_scale * spread, _reach(position, covariance) / spread**2)
+
+
+def _reach(position: FloatArray, covariance: FloatArray) -> float:
+    apart = position - np.median(position, axis=0)
+    return float(np.median(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)))
 
 
 def _by_scatter(centre: FloatArray, position: FloatArray) -> _Judged | None:
@@ -116,7 +129,10 @@ def _by_scatter(centre: FloatArray, position: FloatArray) -> _Judged | None:
         if degrees < _MIN_DEGREES or not np.linalg.eigvalsh(common)[0] > (_EXACT * extent) ** 2:
             return None
         found = align_positions(centre, position, np.tile(common, (len(centre), 1, 1)), cut=cut)
-    return None if found is None else _Judged(found, hotelling_p(found, degrees), np.nan, found.sd_scale)
+    if found is None:
+        return None
+    reach = _reach(position, np.tile(common, (len(centre), 1, 1)))
+    return _Judged(found, hotelling_p(found, degrees), np.nan, found.sd_scale, reach)
 
 
 def hotelling_p(found: PositionAlignment, degrees: float) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.alignment import PoseComparison, Poses, compare_poses, natural_order, usable_poses
+from sfm_audit.audit.alignment import PoseComparison, Poses, align, compare_poses, natural_order, usable_poses
 from sfm_audit.audit.table.thresholds import MAX_REFERENCE_CENTRE, MAX_REFERENCE_ROTATION_DEG, MIN_DRIFT
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
@@ -41,9 +41,34 @@ def ask_reference(evidence: Evidence) -> WitnessReport | None:
     own = Poses.of(quats[rows], shifts[rows])
     theirs = Poses(reference.rotation[rows], reference.centre[rows])
     found = compare_poses(own, theirs, evidence.median_depth)
-    if found is None:
-        return _silent(evidence.model, f"{reference.location}: no 3 of {len(rows)} images lie to each other as there")
+    follow = 0 if found is None else int(found.main.sum()) + sum(len(each.image_idxs) for each in found.fragments)
+    if found is None or 2 * follow < len(rows):
+        text = f"{follow or 'no 3'} of {len(rows)} images lie to each other as there"
+        hint = _convention(own, theirs, evidence.median_depth)
+        return _silent(evidence.model, f"{reference.location}: {text}{hint}")
     return _report(evidence, reference, rows, found)
+
+
+def _convention(own: Poses, theirs: Poses, unit: float) -> str:
+    """Return under which other convention most images would follow the reference, if there is one; or nothing."""
+    back = theirs.rotation.transpose(0, 2, 1)
+    others = (
+        (
+            "if its poses were inverted: camera from world and world from camera are mixed up",
+            Poses(back, -np.einsum("nij,nj->ni", theirs.rotation, theirs.centre)),
+        ),
+        ("with its rotations inverted", Poses(back, theirs.centre)),
+        (
+            "with cameras that look along -z and have y upwards (OpenGL's axes)",
+            Poses(np.diag([1.0, -1.0, -1.0]) @ theirs.rotation, theirs.centre),
+        ),
+    )
+    for text, poses in others:
+        found = align(own, poses, unit)
+        follow = 0 if found is None else np.count_nonzero(found.supports)
+        if 2 * follow > len(own):
+            return f"; {follow} would {text}"
+    return ""
 
 
 def _silent(model: SparseModel, reason: str) -> WitnessReport:

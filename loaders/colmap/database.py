@@ -231,12 +231,12 @@ def check_database(path: Path) -> None:
         raise UnreadableFileError(str(path), None, "a database that is not in use", f"changes in {log.name}", advice)
 
 
-def asked(path: Path, question: Callable[[], T]) -> T:
+def asked(path: Path, question: Callable[[], T], wanted: str = "COLMAP's tables of images and keypoints") -> T:
     """Return the answer of SQLite; its errors, and text that is not UTF-8, become a LoadError."""
     try:
         return question()
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise malformed(path, "COLMAP's tables of images and keypoints", str(error)) from error
+        raise malformed(path, wanted, str(error)) from error
 
 
 def malformed(path: Path, wanted: str, got: str) -> MalformedFileError:

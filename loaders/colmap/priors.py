@@ -25,6 +25,7 @@ WGS84: Final = 0
 CARTESIAN: Final = 1
 NOT_SAID: Final = -1
 _CAMERA: Final = 0
+_WANTED: Final = "COLMAP's tables of images and pose_priors"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +50,7 @@ def read_stored_priors(path: Path) -> StoredPriors:
         It cannot be read, a blob has another size, an image has two priors, or coordinate systems are mixed.
     """
     check_database(path)
-    tables = asked(path, lambda: _tables_of(path))
+    tables = asked(path, lambda: _tables_of(path), _WANTED)
     with closing(asked(path, lambda: open_database(path, tables))) as db:
         names = dict(asked(path, lambda: db.execute("SELECT image_id, name FROM images").fetchall()))
         columns = tables["pose_priors"]
@@ -67,7 +68,7 @@ def read_stored_priors(path: Path) -> StoredPriors:
             continue
         if name in found:
             raise malformed(path, f"one prior of the image {name!r}", "two")
-        covariance = _numbers(path, stored["position_covariance"], 9, f"the covariance of {name!r}").reshape(3, 3)
+        covariance = _numbers(path, stored.get("position_covariance"), 9, f"the covariance of {name!r}").reshape(3, 3)
         found[name] = position, covariance
         systems.add(stored["coordinate_system"])
     if len(systems) > 1 or not systems <= {WGS84, CARTESIAN, NOT_SAID}:

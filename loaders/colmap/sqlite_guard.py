@@ -22,8 +22,9 @@ _PRIOR: Final = ("position", "position_covariance", "coordinate_system")
 PRIOR_TABLES: Final[tuple[Tables, ...]] = (
     {"images": TABLES["images"], "pose_priors": ("corr_data_id", "corr_sensor_type", *_PRIOR)},
     {"images": TABLES["images"], "pose_priors": ("image_id", *_PRIOR)},
+    {"images": TABLES["images"], "pose_priors": ("image_id", _PRIOR[0], _PRIOR[2])},
 )
-"""What is read of position priors: as they are stored since rigs, and before."""
+"""What is read of position priors: as they are stored since rigs, before, and before they had covariances."""
 
 _STEPS: Final = (10_000_000, 16)  # of SQLite's machine: this many, and so many per byte of the file
 _STEPS_PER_CALL: Final = 10_000

@@ -17,6 +17,8 @@ from sfm_audit.loaders.references.poses import ADVICE, PoseList
 
 MAX_GAP_SECONDS: Final = 0.1
 """Between two poses that far apart in time at most, the camera is taken to move evenly."""
+_SAME_SECONDS: Final = 1e-4  # stamps that are printed with four digits
+_MAX_CENTRE: Final = 1e12
 _SECONDS: Final = re.compile(r"(\d{1,12}(?:\.\d{1,12})?)")
 _NANOSECONDS: Final = re.compile(r"(\d{16,20})")
 _NUMBER: Final = re.compile(r"(\d{1,9})\D*")
@@ -43,7 +45,7 @@ def poses_of_images(poses: PoseList, names: Sequence[str], scene: str) -> Refere
     else:
         found = _taken(poses, np.array([_number_of(name, len(poses)) for name in names], dtype=np.int64))
     rotation, centre = found
-    known = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
+    known = np.isfinite(rotation).all(axis=(1, 2)) & (np.abs(centre) < _MAX_CENTRE).all(axis=1)
     if not known.any():
         raise LoadError(poses.location, None, *_missed(poses, names))
     rotation[~known], centre[~known] = np.nan, np.nan
@@ -109,7 +111,10 @@ def _taken(poses: PoseList, rows: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _at_times(poses: PoseList, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Interpolate between the two poses around each time: centres along a line, rotations by their means."""
+    """Interpolate between the two poses around each time: centres along a line, rotations by their means.
+
+    A time that is that of a pose needs no second one, however far the next is.
+    """
     times = poses.seconds if poses.seconds is not None else np.empty(0)
     after = np.clip(np.searchsorted(times, seconds), 1, max(len(times) - 1, 1))
     before = after - 1
@@ -118,8 +123,11 @@ def _at_times(poses: PoseList, seconds: FloatArray) -> tuple[FloatArray, FloatAr
     gap = times[after] - times[before]
     with np.errstate(all="ignore"):
         share = np.where(gap > 0, (seconds - times[before]) / gap, 0.0)
-    inside = (seconds >= times[before]) & (seconds <= times[after]) & (gap <= MAX_GAP_SECONDS)
+    inside = (seconds >= times[before]) & (seconds <= times[after]) & (gap <= MAX_GAP_SECONDS + _SAME_SECONDS)
     share = np.where(inside, share, 0.0)
+    nearest = np.where(np.abs(seconds - times[after]) < np.abs(seconds - times[before]), after, before)
+    same = ~inside & (np.abs(seconds - times[nearest]) <= _SAME_SECONDS)
+    before, after, inside = np.where(same, nearest, before), np.where(same, nearest, after), inside | same
     centre = (1 - share)[:, None] * poses.centre[before] + share[:, None] * poses.centre[after]
     mixed = (1 - share)[:, None, None] * poses.rotation[before] + share[:, None, None] * poses.rotation[after]
     inside &= np.isfinite(mixed).all(axis=(1, 2))

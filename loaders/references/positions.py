@@ -23,7 +23,7 @@ from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.paths.files import open_input, reading
 from sfm_audit.loaders.paths.locations import InputPath, parse_location
 from sfm_audit.loaders.paths.text_lines import TextFile, parse_floats, read_text
-from sfm_audit.loaders.references.geodesy import enu_of
+from sfm_audit.loaders.references.geodesy import ecef_of, enu_of
 from sfm_audit.loaders.references.matching import rows_by_name
 from sfm_audit.loaders.references.poses import ADVICE, MAX_POSES
 
@@ -78,9 +78,15 @@ def _of_images(model: SparseModel, path: InputPath) -> PositionPriors | NotAsked
     position, covariance = stored.position[rows], stored.covariance[rows]  # row -1 is replaced
     position[rows < 0], covariance[rows < 0] = np.nan, np.nan
     if stored.system == WGS84:
-        origin = stored.position[rows[rows >= 0][0]]
-        position = enu_of(position, origin)
+        position = enu_of(position, _middle_of(stored.position[rows[rows >= 0]]))
     return PositionPriors(str(path), position, covariance, is_metric)
+
+
+def _middle_of(geodetic: FloatArray) -> FloatArray:
+    """Return the one of (n, 3) positions that is nearest to their median, which one wrong prior does not move."""
+    ecef = ecef_of(geodetic)
+    nearest: FloatArray = geodetic[np.argmin(((ecef - np.median(ecef, axis=0)) ** 2).sum(axis=1))]
+    return nearest
 
 
 def read_priors(path: InputPath) -> tuple[StoredPriors, bool]:

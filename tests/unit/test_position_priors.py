@@ -51,12 +51,12 @@ def test_the_earth_is_pycolmap_s(place):
     assert_allclose(enu_of(near, np.array(place)), earth.ellipsoid_to_enu(near, *place), atol=1e-6)
 
 
-def test_priors_of_a_database_are_metres_about_the_first(tmp_path, model):
+def test_priors_of_a_database_are_metres_about_their_middle(tmp_path, model):
     path = write_database(tmp_path / "database.db")
     found = priors_of(model, "auto", "shown")
     order = [NAMES.index(name) for name in model.images.name if name in NAMES]
     known = [i for i, name in enumerate(model.images.name) if name in NAMES]
-    wanted = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84).ellipsoid_to_enu(PLACES, *PLACES[order[0]])
+    wanted = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84).ellipsoid_to_enu(PLACES, *PLACES[order[1]])
     assert_allclose(found.position[known], wanted[order], atol=1e-6)
     assert_allclose(found.covariance[known], np.tile(COVARIANCE, (3, 1, 1)))
     assert np.isnan(found.position[model.image_idx("stranger.jpg")]).all()
@@ -192,3 +192,23 @@ def test_cut_anywhere_a_database_is_refused_or_whole(tmp_path, model):
         path.write_bytes(content[:size])
         with pytest.raises(LoadError):
             priors_of(model, str(path), "")
+
+
+def test_priors_from_before_they_had_covariances(tmp_path):
+    path = write_database(tmp_path / "database.db")
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("ALTER TABLE pose_priors RENAME TO newer")
+        db.execute("CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY, position BLOB, coordinate_system INTEGER)")
+        db.execute("INSERT INTO pose_priors SELECT corr_data_id, position, coordinate_system FROM newer")
+    stored, is_metric = read_priors(path)
+    assert_allclose(stored.position, PLACES)
+    assert np.isnan(stored.covariance).all()
+    assert is_metric
+
+
+def test_a_database_without_priors_says_which_table_it_lacks(tmp_path):
+    path = write_database(tmp_path / "database.db")
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("DROP TABLE pose_priors")
+    with pytest.raises(LoadError, match=r"tables of images and pose_priors, found no such table: pose_priors"):
+        read_priors(path)

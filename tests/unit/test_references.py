@@ -234,3 +234,28 @@ def test_odd_numbers_are_refused_or_not_known(tmp_path, kind, odd):
 def test_what_is_wrong_is_said(tmp_path, text, what):
     with pytest.raises(LoadError, match=what):
         read_poses(written(tmp_path, text))
+
+
+def test_a_time_that_is_a_pose_s_needs_no_second_one(tmp_path):
+    """Key frames 2 s apart; stamps that are rounded otherwise, also of the first and the last pose."""
+    poses = read_poses(written(tmp_path, tum((1.0, 3.0, 5.0, 7.0))))
+    found = poses_of_images(poses, ["0.99995.png", "3.0.png", "5.00005.png", "7.00005.png", "3.001.png"], "")
+    assert_allclose(found.centre[:4], CENTRES)
+    assert_allclose(found.rotation[:4], TURNS.as_matrix(), atol=1e-6)
+    assert np.isnan(found.centre[4]).all()
+
+
+def test_poses_at_ten_hertz_are_near_enough(tmp_path):
+    """A step of 0.1 s is a little more in binary."""
+    start = 1403636580.838556
+    poses = read_poses(written(tmp_path, tum(tuple(start + k / 10 for k in range(4)))))
+    found = poses_of_images(poses, [f"{start + k / 10 + 0.05:.6f}.png" for k in range(3)], "")
+    assert np.isfinite(found.centre).all()
+
+
+def test_centres_that_no_number_holds_squared_are_not_known(tmp_path):
+    poses = read_poses(written(tmp_path, tum()))
+    poses.centre[1] = 1e200
+    found = poses_of_images(poses, ["1.0.png", "1.05.png"], "")
+    assert_allclose(found.centre[0], CENTRES[0])
+    assert np.isnan(found.centre[1]).all()

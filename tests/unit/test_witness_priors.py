@@ -200,3 +200,24 @@ def test_columns_and_verdict(model):
     assert row["verdict_outside"] == "undetermined"
     assert any(each.startswith("priors_disagree: its centre is ") for each in row["reasons"])
     assert row["prior_chi2"] > MAX_PRIOR_CHI2
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_priors_of_other_images_are_no_pass(model, auditor, said):
+    """Names that were mixed up: the scatter takes everything, and everything would agree."""
+    rng = np.random.default_rng(8)
+    priors = priors_to(model, rng)
+    order = rng.permutation(len(model.images))
+    covariance = priors.covariance if said else np.full_like(priors.covariance, np.nan)
+    report = asked(auditor, model, replace(priors, position=priors.position[order], covariance=covariance))
+    assert report.witness is None
+    assert [finding.code for finding in report.findings] == [FindingCode.PRIORS_NOT_USED]
+    assert "its columns, unit or names differ" in report.findings[0].text
+
+
+@pytest.mark.parametrize(("size", "used"), [(0.05, True), (1e3, False)])
+def test_a_sensor_that_would_let_everything_pass_is_not_asked(model, auditor, size, used):
+    priors = priors_to(model, np.random.default_rng(9))
+    covariance = np.tile(size**2 * np.eye(3), (len(model.images), 1, 1))
+    report = asked(auditor, model, replace(priors, covariance=covariance))
+    assert (report.witness is Witness.PRIORS) == used

@@ -174,3 +174,40 @@ def test_smoothness_is_von_neumann_s_ratio():
     assert smoothness_p(errors[:4]) < 0.1
     assert smoothness_p(np.ones((6, 2))) == 1.0
     assert LEVEL < 0.05
+
+
+def other_convention(reference, name):
+    rotation, centre = reference.rotation, reference.centre
+    back = rotation.transpose(0, 2, 1)
+    if name == "inverted":
+        return replace(reference, rotation=back, centre=-np.einsum("nij,nj->ni", rotation, centre))
+    if name == "rotations":
+        return replace(reference, rotation=back)
+    return replace(reference, rotation=np.diag([1.0, -1.0, -1.0]) @ rotation)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("inverted", "if its poses were inverted"), ("rotations", "its rotations inverted"), ("axes", "OpenGL")],
+)
+def test_another_convention_is_named_and_blames_no_image(model, auditor, name, words):
+    report = asked(auditor, model, other_convention(reference_to(model), name))
+    assert report.witness is None
+    assert codes(report) == [FindingCode.REFERENCE_NOT_USED]
+    assert f"; {len(model.images)} would" in report.findings[0].text
+    assert words in report.findings[0].text
+
+
+@pytest.mark.parametrize(("right", "used"), [(0.5, True), (0.49, False)])
+def test_a_reference_that_few_images_follow_blames_nobody(model, auditor, right, used):
+    """Three images may follow any similarity by chance: less than half of all is no reference to these images."""
+    rng = np.random.default_rng(2)
+    n = len(model.images)
+    shift = 1e3 * rng.normal(size=(n, 3))
+    shift[: int(np.ceil(right * n)) if used else int(np.ceil(n / 2)) - 1] = 0.0
+    report = asked(auditor, model, reference_to(model, shift))
+    assert (report.witness is Witness.REFERENCE) == used
+    if not used:
+        assert codes(report) == [FindingCode.REFERENCE_NOT_USED]
+        assert f" of {n} images lie to each other as there" in report.findings[0].text
+        assert "would" not in report.findings[0].text
