@@ -9,7 +9,7 @@ Blind to what the similarity takes up (global scale, place, turn), and to what i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -85,7 +85,7 @@ class _Judged:
     p: FloatArray
     spread: float
     sd_scale: float
-    reach: float
+    reach: float = np.inf
 
     @property
     def chi2(self) -> FloatArray:
@@ -98,14 +98,17 @@ def _judged(centre: FloatArray, position: FloatArray, covariance: FloatArray) ->
     """Align, and judge by the covariances, or by the scatter where one of them is not known."""
     if np.isfinite(covariance).all():
         found = align_positions(centre, position, covariance)
-        return None if found is None else _by_covariance(found, position, covariance)
+        if found is None:
+            return None
+        judged = _by_covariance(found)
+        return replace(judged, reach=_reach(position, covariance) / max(judged.spread, 1.0) ** 2)
     return _by_scatter(centre, position)
 
 
-def _by_covariance(found: PositionAlignment, position: FloatArray, covariance: FloatArray) -> _Judged:
+def _by_covariance(found: PositionAlignment) -> _Judged:
     spread = max(found.spread, 1.0)
     p = spread_p(found.chi2 / spread**2, len(found.chi2)) if spread > 1.0 else prior_p(found.chi2)
-    return _Judged(found, p, found.spread, found.sd_scale * spread, _reach(position, covariance) / spread**2)
+    return _Judged(found, p, found.spread, found.sd_scale * spread)
 
 
 def _reach(position: FloatArray, covariance: FloatArray) -> float:
