@@ -82,8 +82,9 @@ def unknown_pose() -> PoseCovariance:
 
 
 def _length(covariance: FloatArray) -> float:
+    """Root of the trace; NaN where the gauge took all digits of it away, which would look like an exact pose."""
     trace = float(np.trace(covariance))
-    return math.sqrt(max(trace, 0.0)) if math.isfinite(trace) else math.nan
+    return math.sqrt(trace) if math.isfinite(trace) and trace > 0 else math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

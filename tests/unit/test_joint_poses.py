@@ -16,6 +16,7 @@ from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.audit.inliers.frames import cross_matrix
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.joint import PoseGauge, audit_jointly, joint_system, pose_covariances, pose_gauge
+from sfm_audit.audit.joint.poses import PoseCovariance
 from sfm_audit.audit.simulate.colmap_files import write_colmap_binary
 from sfm_audit.audit.table import schema
 from sfm_audit.audit.table.pose_columns import GAUGE, POSE_COLUMNS
@@ -130,6 +131,14 @@ def test_what_is_said_of_a_pose(system):
         ]
         shared[image] = 0
         assert shared[pose.neighbour_idx] == max(shared)
+
+
+@pytest.mark.parametrize("variance", [0.0, -1e-12])
+def test_what_rounding_left_nothing_of_is_not_known_exactly(variance):
+    """Two images and a free camera: the gauge is most of what is known, and its difference to all of it was 0."""
+    known = PoseCovariance(np.diag([1.0] * 3 + [variance] * 3), None, np.full((6, 6), np.nan))
+    assert np.isnan(known.sd_centre)
+    assert known.sd_rotation_deg == pytest.approx(np.degrees(np.sqrt(3)))
 
 
 def test_the_turn_against_a_neighbour_does_not_depend_on_the_gauge(system):
