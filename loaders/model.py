@@ -137,7 +137,7 @@ FINDING_MEANINGS: Final[dict[FindingCode, str]] = {
     FindingCode.REFERENCE_SCALE: "how long a unit of the model is in the metres of its reference",
     FindingCode.REFERENCE_DRIFT: "neighbours in the sequence share their distance from the reference: the model bends",
     FindingCode.REFERENCE_FRAGMENTS: "images that lie together elsewhere than the reference has them",
-    FindingCode.PRIORS_NOT_USED: "there are no position priors for the model, or too few: they were not asked",
+    FindingCode.PRIORS_NOT_USED: "there are no position priors for the model, too few, or they do not fit: not asked",
     FindingCode.PRIORS_SCALE: "how long a unit of the model is in the metres of its position priors",
     FindingCode.PRIORS_DRIFT: "neighbours in the sequence share their distance from the priors: model or sensor drift",
     FindingCode.PRIORS_SPREAD: "position priors scatter more widely about the model than their covariances say",

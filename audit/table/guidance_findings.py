@@ -265,8 +265,9 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
         "That the model is folded: one in four right models of real photos looks so.",
     ),
     FindingCode.REFERENCE_NOT_USED: Guidance(
-        "The reference of other images, names that do not fit it, or poses of another body than the camera.",
-        "Name the reference of these photos with --reference, or leave the option out.",
+        "The reference of other images, names that do not fit it, poses of another body than the camera, or poses "
+        "stored the other way round (camera from world, world from camera).",
+        "Name the reference of these photos with --reference, its poses as docs/witnesses.md says of its format.",
         "Anything about the reference: it was not asked.",
     ),
     FindingCode.REFERENCE_SCALE: Guidance(
@@ -285,8 +286,9 @@ FINDING_GUIDANCE: Final[dict[FindingCode, Guidance]] = {
         "That the smaller group is the wrong one.",
     ),
     FindingCode.PRIORS_NOT_USED: Guidance(
-        "A database without priors, photos without GPS, names that do not fit, fewer than six priors.",
-        "Name them with --priors, or leave the option out.",
+        "A database without priors, photos without GPS, names that do not fit, fewer than six priors; swapped columns, "
+        "another unit, or a place smaller than the noise of the sensor.",
+        "Look at names, columns and unit of the priors, or leave --priors out.",
         "Anything about priors: none were asked.",
     ),
     FindingCode.PRIORS_SCALE: Guidance(

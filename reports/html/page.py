@@ -115,7 +115,8 @@ def _witnesses(content: RunContent) -> str:
     """Say which witnesses outside of the images were asked, and of how many images they could say something."""
     asked = Counter(name for row in content.models for name in row["witnesses"] or [])
     num_spoken_of = sum(content.counts[Member.OUTSIDE].values()) if Member.OUTSIDE in content.counts else 0
-    return witnesses_line(asked, len(content.models), content.num_images, num_spoken_of)
+    codes = {str(finding["code"]) for row in content.models for finding in row["findings"] or []}
+    return witnesses_line(asked, len(content.models), content.num_images, num_spoken_of, codes)
 
 
 def _breakable(name: str) -> Markup:

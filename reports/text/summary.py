@@ -333,7 +333,9 @@ def _closing(run: RunReader, models: _Models, page: Page) -> list[str]:
 
 def _witnesses(models: _Models) -> str:
     num_spoken_of = sum(models.sums[f"num_{verdict}_{Member.OUTSIDE.short}"] for verdict in Verdict)
-    return witnesses_line(models.witnesses, models.num_models, models.sums["num_images"], num_spoken_of)
+    return witnesses_line(
+        models.witnesses, models.num_models, models.sums["num_images"], num_spoken_of, models.findings
+    )
 
 
 def _model_order(row: Row) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from sfm_audit.reports.text.wording import counted, paragraph, plain
@@ -11,18 +11,24 @@ NOBODY: Final = (
     "Nobody outside of the images was asked (run --database auto asks verified pairs of a database.db, --reference "
     "known poses, --priors positions of a sensor)."
 )
+UNUSED: Final = "Nobody outside of the images was asked: what was named does not fit, as findings say"
+_NOT_USED: Final = ("database_not_used", "reference_not_used", "priors_not_used")
 
 
-def witnesses_line(asked: Mapping[str, int], num_models: int, num_images: int, num_spoken_of: int) -> str:
+def witnesses_line(
+    asked: Mapping[str, int], num_models: int, num_images: int, num_spoken_of: int, findings: Collection[str]
+) -> str:
     """Return one sentence.
 
     Parameters
     ----------
     asked : in how many models each witness was asked
     num_spoken_of : images of which some witness could say something
+    findings : codes of all findings of the models
     """
     if not asked:
-        return NOBODY
+        unused = [code for code in _NOT_USED if code in findings]
+        return f"{UNUSED} ({', '.join(unused)})." if unused else NOBODY
     said = [f"{name} in {num} of {counted(num_models, 'model')}" for name, num in asked.items()]
     silent = num_images - num_spoken_of
     rest = f"; they can say nothing of {silent} of {counted(num_images, 'image')}" if silent else ""
