@@ -17,6 +17,7 @@ from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 
 from sfm_audit.audit.alignment import Poses, natural_order, usable_poses
 from sfm_audit.audit.alignment.positions import (
+    CHI2_3_MEDIAN,
     MIN_POSITIONS,
     NUM_PARAMETERS,
     PositionAlignment,
@@ -101,7 +102,7 @@ def _judged(centre: FloatArray, position: FloatArray, covariance: FloatArray) ->
         if found is None:
             return None
         judged = _by_covariance(found)
-        return replace(judged, reach=_reach(position, covariance) / max(judged.spread, 1.0) ** 2)
+        return replace(judged, reach=_reach(found, position, np.linalg.inv(covariance).astype(np.float64), 1.0))
     return _by_scatter(centre, position)
 
 
@@ -111,9 +112,11 @@ def _by_covariance(found: PositionAlignment) -> _Judged:
     return _Judged(found, p, found.spread, found.sd_scale * spread)
 
 
-def _reach(position: FloatArray, covariance: FloatArray) -> float:
+def _reach(found: PositionAlignment, position: FloatArray, weight: FloatArray, least: float) -> float:
+    """Return `_Judged.reach`; the scatter is that of all positions, in the fit or not, and at least ``least``."""
     apart = position - np.median(position, axis=0)
-    return float(np.median(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)))
+    far, near = (float(np.median(np.einsum("ni,nij,nj->n", x, weight, x))) for x in (apart, found.residual))
+    return far / max(near / CHI2_3_MEDIAN, least, float(np.finfo(float).tiny))
 
 
 def _by_scatter(centre: FloatArray, position: FloatArray) -> _Judged | None:
@@ -134,7 +137,7 @@ def _by_scatter(centre: FloatArray, position: FloatArray) -> _Judged | None:
         found = align_positions(centre, position, np.tile(common, (len(centre), 1, 1)), cut=cut)
     if found is None:
         return None
-    reach = _reach(position, np.tile(common, (len(centre), 1, 1)))
+    reach = _reach(found, position, unit, 0.0)
     return _Judged(found, hotelling_p(found, degrees), np.nan, found.sd_scale, reach)
 
 

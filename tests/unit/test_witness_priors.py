@@ -19,7 +19,7 @@ from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.table.thresholds import MAX_PRIOR_CHI2, MAX_PRIOR_SPREAD
 from sfm_audit.audit.table.witnesses import Witness
 from sfm_audit.audit.witnesses.evidence import Evidence
-from sfm_audit.audit.witnesses.priors import ask_priors, prior_p
+from sfm_audit.audit.witnesses.priors import _judged, ask_priors, prior_p
 from sfm_audit.loaders.evidence import Given, NotAsked, PositionPriors
 from sfm_audit.loaders.model import FindingCode
 
@@ -221,3 +221,17 @@ def test_a_sensor_that_would_let_everything_pass_is_not_asked(model, auditor, si
     covariance = np.tile(size**2 * np.eye(3), (len(model.images), 1, 1))
     report = asked(auditor, model, replace(priors, covariance=covariance))
     assert (report.witness is Witness.PRIORS) == used
+
+
+def test_mixed_up_priors_of_a_street_are_no_pass_whoever_is_left_out_of_the_fit():
+    """On a line some directions fit whatever the order is, and the fit may leave half of the positions out."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        centre = np.c_[np.arange(40.0), 0.05 * rng.normal(size=(40, 2))]
+        position = positions(centre, np.tile(1e-4 * np.eye(3), (40, 1, 1)), rng)
+        mixed = position[rng.permutation(40)]
+        for size in (1e-4, np.nan):
+            covariance = np.tile(size * np.eye(3), (40, 1, 1))
+            assert _judged(centre, position, covariance).reach > 1e3
+            found = _judged(centre, mixed, covariance)
+            assert found is None or found.reach < MAX_PRIOR_CHI2
