@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.rejections import REJECTING_CODES, CountedRejections, counted, verdict_counts
+from sfm_audit.audit.decision.rejections import NAMEABLE_CODES, CountedRejections, counted, verdict_counts
 from sfm_audit.audit.decision.triage import CAMERA_COLUMNS, IMAGE_COLUMNS, triage
 from sfm_audit.audit.table.words import POLICIES, ReasonCode, Severity
 from sfm_audit.loaders.model import FindingCode
@@ -78,9 +78,10 @@ def with_again(command: _Command) -> _Command:
             "--reason",
             "reasons",
             metavar="CODE",
-            callback=_rejecting_codes,
+            callback=_nameable_codes,
             multiple=True,
-            help="Only rejections for this reason count, others become undetermined. Repeatable.",
+            help="Only rejections for this reason count, others become undetermined; a witness that leaves images open "
+            "rejects where it is named. Repeatable.",
         ),
         click.option(
             "--severity",
@@ -94,12 +95,12 @@ def with_again(command: _Command) -> _Command:
     return command
 
 
-def _rejecting_codes(context: click.Context, param: click.Parameter, values: tuple[str, ...]) -> tuple[ReasonCode, ...]:
+def _nameable_codes(context: click.Context, param: click.Parameter, values: tuple[str, ...]) -> tuple[ReasonCode, ...]:
     """Return the codes; a misspelt one is told what it may have meant."""
     for value in values:
-        if value not in REJECTING_CODES:
-            close = difflib.get_close_matches(value, REJECTING_CODES, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(REJECTING_CODES)}"
+        if value not in NAMEABLE_CODES:
+            close = difflib.get_close_matches(value, NAMEABLE_CODES, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(NAMEABLE_CODES)}"
             raise click.BadParameter(f"{value!r} is no reason that rejects; {hint}", context, param)
     return tuple(ReasonCode(value) for value in values)
 

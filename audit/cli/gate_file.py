@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.cli.toml_file import read_toml, shown
+from sfm_audit.audit.decision.rejections import REJECTING_CODES
 from sfm_audit.audit.table.words import ReasonCode
 from sfm_audit.reports.compare.gate_policy import Band, GatePolicy, Limits, PartPolicy
 
@@ -20,6 +21,8 @@ _KEYS_OF: Final[dict[str, type[BaseModel]]] = {
     "dataset": PartPolicy,
     "scene": PartPolicy,
 }
+
+_OF_REJECTED: Final = "max_share_rejected_by_reason"
 
 
 def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
@@ -37,12 +40,13 @@ def read_gate_file(file: Path, *, has_baseline: bool) -> GatePolicy:
     except ValidationError as error:
         raise KnownError(f"{file}: {_problem(error.errors()[0])}", ExitCode.USAGE) from error
     codes = {str(code) for code in ReasonCode}
-    for code in policy.reason_codes:
+    for key, code in policy.reason_codes:
         if code not in codes:
-            hint = did_you_mean(code, codes)
-            problem = f"{file}: max_share_rejected_by_reason: unknown reason {code[:80]}"
-            problem += hint or "; docs/verdicts.md lists them"
-            raise KnownError(problem, ExitCode.USAGE)
+            problem = f"unknown reason {code[:80]}{did_you_mean(code, codes) or '; docs/verdicts.md lists them'}"
+            raise KnownError(f"{file}: {key}: {problem}", ExitCode.USAGE)
+        if key == _OF_REJECTED and code not in REJECTING_CODES:
+            problem = f"{code} rejects no image, so no share is too large; use max_share_by_reason"
+            raise KnownError(f"{file}: {key}: {problem}", ExitCode.USAGE)
     if policy.needs_baseline and not has_baseline:
         raise KnownError(f"{file}: {policy.needs_baseline} needs --baseline RUN0", ExitCode.USAGE)
     return policy

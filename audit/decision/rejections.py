@@ -1,4 +1,7 @@
-"""Which rejections count? Those for some reasons, those that are severe enough; the others leave their image open."""
+"""Which rejections count? Those for some reasons, those that are severe enough; the others leave their image open.
+
+A witness that may not reject of itself does where it is named: whoever names it trusts it.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import pyarrow as pa
 from sfm_audit.audit.table.words import (
     REASONS,
     SEVERITY_ORDER,
+    WITNESS_CODES,
     Member,
     ReasonCode,
     Severity,
@@ -19,13 +23,17 @@ from sfm_audit.audit.table.words import (
 
 REJECTING_CODES: Final = tuple(code for code, words in REASONS.items() if words.makes is Verdict.REJECTED)
 """Reasons that can reject an image."""
+NAMEABLE_CODES: Final = tuple(dict.fromkeys((*REJECTING_CODES, *WITNESS_CODES.values())))
+"""Reasons that reject an image, of itself or where they are named."""
+_BY_NAME: Final = frozenset(NAMEABLE_CODES) - frozenset(REJECTING_CODES)
 
 
 @dataclass(frozen=True, slots=True)
 class CountedRejections:
     """Which rejections count.
 
-    reasons: those that have one of these among the reasons of the policy; all where it is empty.
+    reasons: those that have one of these among the reasons of the policy; all where it is empty. Codes of witnesses
+        among them reject what they leave undetermined of themselves, as long as no severity is asked for.
     at_least: those of this severity or a worse one; None for all.
     """
 
@@ -43,18 +51,24 @@ class CountedRejections:
         if self.at_least is not None:
             worse = "" if self.at_least is Severity.HARD else " or worse"
             said.append(f"of severity {self.at_least}{worse}")
-        return f"only rejections {' and '.join(said)} count, others are undetermined" if said else ""
+        by_name = " or ".join(sorted(self._by_name))
+        also = f"; {by_name} rejects what it leaves open of itself" if by_name else ""
+        return f"only rejections {' and '.join(said)} count, others are undetermined{also}" if said else ""
+
+    @property
+    def _by_name(self) -> frozenset[ReasonCode]:
+        """The reasons that reject because they are named; none has a severity."""
+        return self.reasons & _BY_NAME if self.at_least is None else frozenset()
 
     def verdict(self, row: Mapping[str, Any]) -> str | None:
         """Return the verdict of an image by the columns ``verdict``, ``severity`` and ``reasons`` of its row."""
-        if row["verdict"] != Verdict.REJECTED or self._counts(row):
-            verdict: str | None = row["verdict"]
-            return verdict
-        return Verdict.UNDETERMINED
+        verdict: str | None = row["verdict"]
+        if verdict == Verdict.UNDETERMINED and self._by_name & _codes(row):
+            return Verdict.REJECTED
+        return verdict if verdict != Verdict.REJECTED or self._counts(row) else Verdict.UNDETERMINED
 
     def _counts(self, row: Mapping[str, Any]) -> bool:
-        codes = {said.partition(":")[0] for said in row["reasons"] or ()}
-        if self.reasons and not self.reasons & codes:
+        if self.reasons and not self.reasons & _codes(row):
             return False
         severities = set(Severity)
         if self.at_least is None:
@@ -62,8 +76,14 @@ class CountedRejections:
         return row["severity"] in severities and SEVERITY_ORDER[row["severity"]] <= SEVERITY_ORDER[self.at_least]
 
 
+def _codes(row: Mapping[str, Any]) -> set[str]:
+    return {said.partition(":")[0] for said in row["reasons"] or ()}
+
+
 def counted(images: pa.Table, rule: CountedRejections) -> pa.Table:
     """Return the images table of a run with ``verdict`` undetermined where a rejection does not count.
+
+    Rejected where a witness speaks against an image that does not reject unless it is named.
 
     Undetermined and not accepted: nobody said that such an image is right. Its reasons and member verdicts stay.
     """

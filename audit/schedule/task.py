@@ -130,7 +130,7 @@ def _given(task: Task, model: SparseModel) -> Given:
     return Given(
         verified_pairs_of(model, config.database, ref.model_path),
         reference_of(model, config.reference, ref.below, ref.scene) if config.reference is not None else None,
-        priors_of(model, config.priors, ref.model_path) if config.priors is not None else None,
+        priors_of(model, config.priors, ref.model_path, ref.below) if config.priors is not None else None,
     )
 
 

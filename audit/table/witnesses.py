@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from sfm_audit.loaders.model import FindingCode
+
 MAX_FALSE_ALARMS: Final = 0.01
 """Upper end of Wilson's 95 % interval of its share of false alarms on healthy images of real photos, before it may
 reject: at least 381 images."""
@@ -30,13 +32,14 @@ class WitnessWords:
     """What a witness is asked, and what it may decide.
 
     question: of each image.    needs: what it has to be given.    num_false_alarms, num_healthy: healthy images of real
-    photos that it spoke against, and that it was asked about (docs/witnesses.md).
+    photos that it spoke against, and that it was asked about (docs/witnesses.md).    findings: of the model.
     """
 
     question: str
     needs: str
     num_false_alarms: int = 0
     num_healthy: int = 0
+    findings: tuple[FindingCode, ...] = ()
 
     @property
     def may_reject(self) -> bool:
@@ -59,15 +62,31 @@ WITNESSES: Final[dict[Witness, WitnessWords]] = {
         "the database.db of the model (--database)",
         num_false_alarms=0,
         num_healthy=563,  # scripts/study_pairs.py
+        findings=(FindingCode.CONTRADICTED_PAIRS, FindingCode.DATABASE_NOT_USED),
     ),
-    Witness.FOLD: WitnessWords("is a point seen by all images that should see it?", "nothing but the model"),
+    Witness.FOLD: WitnessWords(
+        "is a point seen by all images that should see it?",
+        "nothing but the model",
+        findings=(FindingCode.POSSIBLE_FOLD,),
+    ),
     Witness.REFERENCE: WitnessWords(
         "is the pose where a reference has it?",
         "poses of a reference (--reference)",
         num_false_alarms=1,
         num_healthy=196,  # scripts/study_references.py
+        findings=(
+            *(FindingCode.REFERENCE_NOT_USED, FindingCode.REFERENCE_FRAGMENTS),
+            *(FindingCode.REFERENCE_DRIFT, FindingCode.REFERENCE_SCALE),
+        ),
     ),
-    Witness.PRIORS: WitnessWords("is the centre where its prior has it?", "position priors (--priors)"),
+    Witness.PRIORS: WitnessWords(
+        "is the centre where its prior has it?",
+        "position priors (--priors)",
+        findings=(
+            *(FindingCode.PRIORS_NOT_USED, FindingCode.PRIORS_DRIFT),
+            *(FindingCode.PRIORS_SPREAD, FindingCode.PRIORS_SCALE),
+        ),
+    ),
 }
 """The one list of witnesses, with what was measured of each."""
 

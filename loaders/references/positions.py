@@ -9,6 +9,8 @@ with # are comments.
 from __future__ import annotations
 
 import csv
+import os
+import posixpath
 from pathlib import Path
 from typing import Final
 
@@ -39,13 +41,15 @@ _MAX_COORDINATE: Final = 1e12
 _NAMES_SHOWN: Final = (8, 20)  # of a header that is none: so many names, so many characters of each
 
 
-def priors_of(model: SparseModel, priors: str, shown_as: str) -> PositionPriors | NotAsked:
+def priors_of(model: SparseModel, priors: str, shown_as: str, below: str = "") -> PositionPriors | NotAsked:
     """Return the position priors of a model's images.
 
     Parameters
     ----------
     priors : ``auto``: the database beside the model or up to three folders above; or a database, or a CSV file
     shown_as : the model's location for messages
+    below : the path of the model below what was given, with slashes: a database that belongs to the model is called
+        by its place there
 
     Returns
     -------
@@ -64,22 +68,27 @@ def priors_of(model: SparseModel, priors: str, shown_as: str) -> PositionPriors 
         if path is None:
             wanted = "a database.db beside the model or up to three folders above it"
             raise MissingFileError(shown_as, None, wanted, "none", "name it with --priors")
-        return _of_images(model, path)
+        return _of_images(model, path, _shown(path, model.location, below))
     except LoadError as error:
         return NotAsked(str(error))
 
 
-def _of_images(model: SparseModel, path: InputPath) -> PositionPriors | NotAsked:
+def _shown(path: Path, location: str, below: str) -> str:
+    """Return how findings call the database of a model: from the data set, or else from the model."""
+    return posixpath.normpath(posixpath.join(below, Path(os.path.relpath(path, location)).as_posix()))
+
+
+def _of_images(model: SparseModel, path: InputPath, shown: str | None = None) -> PositionPriors | NotAsked:
     stored, is_metric = read_priors(path)
     rows = rows_by_name(stored.names, list(range(len(stored.names))), model.images.name)
     if not (rows >= 0).any():
         wanted, got = "priors of the model's images", f"{len(stored.names)} of other images" if stored.names else "none"
-        return NotAsked(str(LoadError(str(path), None, wanted, got, ADVICE)))
+        return NotAsked(str(LoadError(shown or str(path), None, wanted, got, ADVICE)))
     position, covariance = stored.position[rows], stored.covariance[rows]  # row -1 is replaced
     position[rows < 0], covariance[rows < 0] = np.nan, np.nan
     if stored.system == WGS84:
         position = enu_of(position, _middle_of(stored.position[rows[rows >= 0]]))
-    return PositionPriors(str(path), position, covariance, is_metric)
+    return PositionPriors(shown or str(path), position, covariance, is_metric)
 
 
 def _middle_of(geodetic: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Final
 
@@ -116,6 +116,7 @@ class ScopeNumbers:
     """Numbers of one scope in one run; an image counts once, a number of a model once per image.
 
     sigma_px: median of sigma_constant_px.    noise_s0_px, recomputed_error_px: medians of the models' numbers.
+    rejected_by_reason: of the rejected images.    by_reason: of all, whatever the verdict.
     accepted: the images that were accepted.
     """
 
@@ -128,6 +129,7 @@ class ScopeNumbers:
     noise_s0_px: float | None
     recomputed_error_px: float | None
     accepted: tuple[ImageState, ...] = ()
+    by_reason: Mapping[str, int] = field(default_factory=dict)
 
     def share(self, count: int) -> float | None:
         """Return a count as a share of the images, None without images."""
@@ -272,6 +274,7 @@ def _numbers(states: Iterable[ImageState]) -> ScopeNumbers:
         _median(state.noise_s0_px for state in listed),
         _median(state.recomputed_error_px for state in listed),
         tuple(state for state in listed if state.verdict == ACCEPTED),
+        Counter(code for state in listed for code in state.codes),
     )
 
 

@@ -163,19 +163,18 @@ def _band_checks(change: ScopeChange, band: Band) -> Iterator[Check]:
 
 
 def _limit_checks(scope: Scope, limits: Limits, numbers: ScopeNumbers, change: ScopeChange | None) -> Iterator[Check]:
-    by_reason = limits.max_share_rejected_by_reason
+    reasons = (
+        ("max_share_rejected_by_reason", limits.max_share_rejected_by_reason, numbers.rejected_by_reason),
+        ("max_share_by_reason", limits.max_share_by_reason, numbers.by_reason),
+    )
     shares: list[tuple[str, float | None, float | None, Callable[[float], str]]] = [
         ("min_images", limits.min_images, numbers.num_images, _count),
         ("min_share_accepted", limits.min_share_accepted, numbers.share(numbers.num_accepted), _percent),
         ("max_share_rejected", limits.max_share_rejected, numbers.share(numbers.num_rejected), _percent),
         ("max_share_undetermined", limits.max_share_undetermined, numbers.share(numbers.num_undetermined), _percent),
         *(
-            (
-                f"max_share_rejected_by_reason.{code}",
-                allowed,
-                numbers.share(numbers.rejected_by_reason.get(code, 0)),
-                _percent,
-            )
+            (f"{key}.{code}", allowed, numbers.share(counts.get(code, 0)), _percent)
+            for key, by_reason, counts in reasons
             for code, allowed in sorted(by_reason.items())
         ),
         ("max_median_sigma_px", limits.max_median_sigma_px, numbers.sigma_px, _px),

@@ -31,6 +31,7 @@ class Limits(_Section):
     max_share_rejected: _Share | None = None
     max_share_undetermined: _Share | None = None
     max_share_rejected_by_reason: Mapping[str, _Share] = Field(default_factory=dict)
+    max_share_by_reason: Mapping[str, _Share] = Field(default_factory=dict)
     max_median_sigma_px: _Above0 | None = None
     max_noise_s0_px: _Above0 | None = None
     max_recomputed_error_px: _Above0 | None = None
@@ -117,10 +118,11 @@ class GatePolicy(_Section):
         )
 
     @property
-    def reason_codes(self) -> tuple[str, ...]:
-        """All reason codes that the file names."""
+    def reason_codes(self) -> tuple[tuple[str, str], ...]:
+        """All reason codes that the file names, each with its key."""
         limits = [self.limits, *(section.limits for section in (*self.dataset, *self.scene))]
-        return tuple(dict.fromkeys(code for each in limits for code in each.max_share_rejected_by_reason))
+        keys = ("max_share_rejected_by_reason", "max_share_by_reason")
+        return tuple(dict.fromkeys((key, code) for each in limits for key in keys for code in getattr(each, key)))
 
     def _matching(self, scope: Scope) -> list[PartPolicy]:
         if scope.kind == "run":

@@ -6,6 +6,7 @@ from sfm_audit.reports.html.content import MAX_ROWS, RunContent, read_content
 from sfm_audit.reports.html.page import PageInput, render_page
 from sfm_audit.reports.html.pictures import ImagePictures, Picture, draw_camera_field, draw_image
 from sfm_audit.reports.html.scenes import ModelView, chosen_models
+from sfm_audit.reports.html.statements import Statements, witnesses_of
 
 __all__ = [
     "MAX_ROWS",
@@ -14,9 +15,11 @@ __all__ = [
     "PageInput",
     "Picture",
     "RunContent",
+    "Statements",
     "chosen_models",
     "draw_camera_field",
     "draw_image",
     "read_content",
     "render_page",
+    "witnesses_of",
 ]

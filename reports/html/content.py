@@ -11,7 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfm_audit.audit.table import TABLES
+from sfm_audit.audit.table import TABLES, Column
+from sfm_audit.audit.table.columns import GROUP_COLUMNS
 from sfm_audit.audit.table.words import (
     POLICIES,
     SEVERITY_ORDER,
@@ -22,6 +23,7 @@ from sfm_audit.audit.table.words import (
     verdict_under,
 )
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.reports.html.statements import Statements
 from sfm_audit.reports.run_folder.reader import Row, RunReader
 from sfm_audit.reports.text.reasons import reasons_of
 from sfm_audit.reports.text.wording import natural_key
@@ -52,6 +54,7 @@ class RunContent:
     reasons, remarks: by code; remarks decide nothing.    numbers: distributions' column -> one value per image.
     verdicts: one per image.       rows: the worst MAX_ROWS images, the worst first, each with its ``part``.
     cameras: the worst of ``num_cameras``.                models: all model rows.
+    outside: what witnesses outside of the images said of them.
     """
 
     run: RunReader
@@ -66,6 +69,13 @@ class RunContent:
     cameras: list[Row] = field(default_factory=list)
     num_cameras: int = 0
     models: list[Row] = field(default_factory=list)
+    outside: Statements = field(default_factory=Statements)
+
+    @property
+    def columns(self) -> list[Column]:
+        """The columns of its images table."""
+        asked = [name for name in GROUP_COLUMNS if self.config.get(name) is not None]
+        return [*TABLES["images"], *(column for name in asked for column in GROUP_COLUMNS[name])]
 
     @property
     def num_images(self) -> int:
@@ -82,7 +92,7 @@ class RunContent:
 def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
     """Read a run folder; memory grows with ``max_rows``, and by 100 bytes with every other image."""
     content = RunContent(run)
-    columns = [column.name for column in TABLES["images"]]
+    columns = [column.name for column in content.columns]
     chunks: dict[str, list[FloatArray]] = {name: [] for name in DISTRIBUTIONS}
     worst: list[tuple[Any, int, Row]] = []
     for part, rows in run.parts("images", columns):
@@ -90,6 +100,7 @@ def read_content(run: RunReader, *, max_rows: int = MAX_ROWS) -> RunContent:
             values.append(np.array([math.nan if row[name] is None else row[name] for row in rows], dtype=np.float64))
         for row in rows:
             _count(content, row)
+            content.outside.add(row)
             row["part"] = part
         first = len(content.verdicts) - len(rows)
         keyed = [(severity(row), first + i, row) for i, row in enumerate(rows)]

@@ -11,6 +11,7 @@
     if (value === null || value === undefined) return "-";
     if (kind === "p") return value >= 1e-3 || value === 0 ? String(+value.toPrecision(2)) : value.toExponential(0);
     if (kind === "px") return inPx(value);
+    if (kind === "small") return value === 0 || Math.abs(value) >= 1e-3 ? String(+value.toPrecision(3)) : value.toExponential(1);
     if (kind === "number") return Math.abs(value) < 1000 ? value.toFixed(2) : value.toPrecision(3);
     return String(value);
   }
@@ -29,7 +30,7 @@
   }
 
   payload.rows.forEach((row, i) => row.push(i));
-  const numeric = new Set(["count", "px", "number", "p"]);
+  const numeric = new Set(["count", "px", "number", "small", "p"]);
   const source = (column) => (column.name === "image_name" ? NAME : column.name === "codes" ? CODES : factIndex.get(column.name));
   const columns = payload.columns.map((column) => ({
     data: source(column),
@@ -84,9 +85,11 @@
     dialog.scrollTop = 0;
   }
   window.scene = startScene(payload, { open, name: (index) => name(payload.rows[index]), verdict: (index) => at(payload.rows[index], "verdict") });
-  byId("images").addEventListener("click", (event) => {
-    const button = event.target.closest("button.open");
-    if (button) open(Number(button.dataset.row));
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest("[data-row].open");
+    if (!link) return;
+    open(Number(link.dataset.row));
+    event.preventDefault();
   });
   byId("panel-pictures").addEventListener("click", (event) => {
     const target = document.querySelector(event.target.getAttribute("href"));

@@ -20,6 +20,7 @@ from sfm_audit.reports.html.content import MAX_CAMERAS, MAX_SCENES, Reason, RunC
 from sfm_audit.reports.html.payload import Places, camera_title, payload
 from sfm_audit.reports.html.pictures import ImagePictures, Picture
 from sfm_audit.reports.html.scenes import ModelView, draw_view
+from sfm_audit.reports.html.statements import witnesses_of
 from sfm_audit.reports.html.todo import codes_of, diagnoses_of
 from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.explain import LIMITS, plain_reasons
@@ -51,7 +52,6 @@ def render_page(page: PageInput) -> str:
     places = Places.of(content)
     views = [draw_view(view, content.rows) for view in page.views]
     diagnoses, num_diagnoses = diagnoses_of(content)
-    codes = codes_of(content)
     return (
         environment()
         .get_template("report.html.j2")
@@ -75,12 +75,13 @@ def render_page(page: PageInput) -> str:
             num_cameras=content.num_cameras,
             max_cameras=MAX_CAMERAS,
             views=views,
+            witnesses=witnesses_of(content.outside, content.models, content.rows),
             worst=_worst_images(page),
             no_photos=page.no_photos,
             num_rows=len(content.rows),
             diagnoses=diagnoses,
             num_diagnoses=num_diagnoses,
-            codes=codes,
+            codes=(codes := codes_of(content)),
             explained={f"{section.kind}-{section.code}" for section in codes},
             findings=_findings(content),
             failures=[plain(item["message"]) for item in info.get("failures", [])],

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from markupsafe import Markup
 
-from sfm_audit.audit.table import TABLES
 from sfm_audit.audit.table.words import Member
 from sfm_audit.reports.html.content import RunContent
 from sfm_audit.reports.run_folder.reader import Row
@@ -34,7 +33,8 @@ _FIRST_FACT: Final = 5  # of a row, after name, codes, sentences, camera and sce
 class TableColumn:
     """One column of the sortable table.
 
-    kind: name, text, verdict, codes, count, px, number or p.    rank: the higher, the wider the screen that shows it.
+    kind: name, text, verdict, codes, count, px, number, small (three digits) or p.
+    rank: the higher, the wider the screen that shows it.
     """
 
     name: str
@@ -56,8 +56,20 @@ IMAGE_COLUMNS: Final = (
     TableColumn("kurtosis_excess", "Kurtosis", "number", 2),
     TableColumn("pose_offset_px", "Pose, px", "px", 2),
     TableColumn("coverage", "Coverage", "number", 2),
+    *(
+        TableColumn(name, title, "small", 2)
+        for name, title in (
+            ("sd_rotation_deg", "Rotation sd, deg"),
+            ("sd_centre", "Centre sd, depths"),
+            ("reference_centre_rel", "To reference, depths"),
+            ("reference_rotation_deg", "To reference, deg"),
+            ("prior_distance", "To prior"),
+        )
+    ),
     TableColumn("advised_camera_model", "Advised camera", "text", 1),
 )
+_GIVE_WAY: Final = {"ks_p", "kurtosis_excess"}  # to columns that only some runs have
+_OPTIONAL: Final = tuple(column.name for column in IMAGE_COLUMNS if column.kind == "small")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +104,15 @@ def camera_title(row: Row, *, several: bool) -> str:
 
 
 def table_columns(content: RunContent) -> list[TableColumn]:
-    """Return all columns; without the scene where there is only one."""
-    return [column for column in IMAGE_COLUMNS if column.name != "scene" or len(content.scenes) > 1]
+    """Return all columns; without the scene where there is only one, and what was not measured in this run."""
+    unwanted = {"scene"} if len(content.scenes) < 2 else set()
+    unwanted |= {name for name in _OPTIONAL if all(_value(row.get(name)) is None for row in content.rows)}
+    crowded = set() if unwanted.issuperset(_OPTIONAL) else _GIVE_WAY
+    return [
+        replace(column, rank=3) if column.name in crowded else column
+        for column in IMAGE_COLUMNS
+        if column.name not in unwanted
+    ]
 
 
 def payload(
@@ -105,8 +124,8 @@ def payload(
     views: Sequence[Mapping[str, Any] | None] = (),
 ) -> Markup:
     """Return the rows as JSON; ``thumbnails``: of the first rows.    views: of `reports.html.scenes`."""
-    units = {column.name: (column.unit, column.meaning) for column in TABLES["images"]}
-    facts = [name for name in (*(c.name for c in IMAGE_COLUMNS), *_PANEL_ONLY) if name in units]
+    units = {column.name: (column.unit, column.meaning) for column in content.columns}
+    facts = [name for name in (*(c.name for c in table_columns(content)), *_PANEL_ONLY) if name in units]
     facts = [name for name in dict.fromkeys(facts) if name != "image_name"]
     rows = [
         [

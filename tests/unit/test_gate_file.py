@@ -23,6 +23,11 @@ from sfm_audit.audit.cli.gate_file import read_gate_file
         ("band.median_sigma = nan", "band.median_sigma"),
         ("limits.max_share_rejected_by_reason = {ks = 0.1}", "unknown reason ks; docs/verdicts.md lists them"),
         ("limits.max_share_rejected_by_reason = {misfit_radail = 0.1}", "misfit_radail, did you mean misfit_radial?"),
+        ("limits.max_share_by_reason = {priors_disagre = 0.1}", "unknown reason priors_disagre, did you mean priors_"),
+        (
+            "limits.max_share_rejected_by_reason = {priors_disagree = 0.1}",
+            "max_share_rejected_by_reason: priors_disagree rejects no image, so no share is too large; use",
+        ),
         ("limits.max_share_rejected_by_reason.ks_rejected = 2", "limits.max_share_rejected_by_reason.ks_rejected"),
         ("limits.max_lost_images = 0", "limits.max_lost_images needs --baseline RUN0"),
         ('[[scene]]\nmatch = "a"\nlimits.max_lost_images = 0', "scene 'a': limits.max_lost_images needs --baseline"),

@@ -257,3 +257,48 @@ def test_the_page_says_what_to_do_and_explains_its_codes(tmp_path):
     links = {attrs.get("href", "") for tag, attrs in page.elements if tag == "a"}
     wanted = {link for link in links if link.startswith("#code-")}
     assert wanted == {"#code-reason-misfit_radial", "#code-finding-tracks_disagree"}
+
+
+def test_witnesses_link_the_images_they_speak_against(tmp_path):
+    said = ["priors_disagree: 40 m"]
+    run = read_sample(
+        tmp_path / "RUN",
+        20,
+        names=NASTY_NAMES[:3],
+        verdict=["undetermined"] * 15 + ["accepted"] * 5,
+        reasons=[said] * 15 + [[]] * 5,
+        witnesses=[["pairs", "priors"]] * 18 + [["pairs"], None],
+    )
+    content = html.read_content(run)
+    page = Page(html.render_page(html.PageInput(content)))
+    linked = [int(attrs["data-row"]) for tag, attrs in page.elements if tag == "a" and attrs.get("class") == "open"]
+    assert len(linked) == len(set(linked)) == 12
+    assert all(content.rows[i]["reasons"] == said for i in linked)
+    shown = " ".join(" ".join(page.texts).split())
+    assert "pairs 19 none -" in shown
+    assert "priors 18 15 :" in shown
+    assert "and 3 more" in shown
+    assert "Witnesses" not in "".join(
+        Page(html.render_page(html.PageInput(html.read_content(read_sample(tmp_path / "B", 2))))).texts
+    )
+
+
+def test_a_model_s_findings_stand_beside_the_witness_that_made_them():
+    model = {"dataset": "d", "scene": "s", "component": "0", "model_path": "m", "num_images": 5, "witnesses": ["pairs"]}
+    findings = [{"code": "priors_scale", "text": "13 m"}, {"code": "short_tracks", "text": "2 points"}]
+    told = html.witnesses_of(html.Statements(), [{**model, "findings": findings}], [])
+    assert [(line["name"], line["findings"]) for line in told["models"][0]["witnesses"]] == [
+        ("pairs", []),
+        ("priors", [("priors_scale", "13 m")]),
+    ]
+    assert html.witnesses_of(html.Statements(), [{**model, "witnesses": None, "findings": []}], [])["models"] == []
+
+
+@pytest.mark.parametrize(("sds", "there"), [((None, np.nan), False), ((0.001, None), True)])
+def test_columns_that_only_some_runs_have_are_shown_where_they_hold_something(tmp_path, sds, there):
+    run = read_sample(tmp_path / "RUN", 2, sd_rotation_deg=[None, None], sd_centre=list(sds))
+    page = Page(html.render_page(html.PageInput(html.read_content(run))))
+    columns = {column["name"]: column["rank"] for column in page.payload["columns"]}
+    assert ("sd_centre" in columns) == ("sd_centre" in [fact["name"] for fact in page.payload["facts"]]) == there
+    assert columns["ks_p"] == (3 if there else 2)
+    assert not {"sd_rotation_deg", "prior_distance", "reference_centre_rel"} & columns.keys()

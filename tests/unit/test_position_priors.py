@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -54,6 +56,7 @@ def test_the_earth_is_pycolmap_s(place):
 def test_priors_of_a_database_are_metres_about_their_middle(tmp_path, model):
     path = write_database(tmp_path / "database.db")
     found = priors_of(model, "auto", "shown")
+    assert not Path(found.location).is_absolute()
     order = [NAMES.index(name) for name in model.images.name if name in NAMES]
     known = [i for i, name in enumerate(model.images.name) if name in NAMES]
     wanted = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84).ellipsoid_to_enu(PLACES, *PLACES[order[1]])
@@ -62,6 +65,23 @@ def test_priors_of_a_database_are_metres_about_their_middle(tmp_path, model):
     assert np.isnan(found.position[model.image_idx("stranger.jpg")]).all()
     assert found.is_metric
     assert priors_of(model, str(path), "").location == str(path)
+
+
+@pytest.mark.parametrize(
+    ("below", "up", "shown"),
+    [
+        ("", 0, "database.db"),
+        ("", 2, "../../database.db"),
+        ("town/sparse/0", 2, "town/database.db"),
+        ("sparse/0", 2, "database.db"),
+        ("0", 2, "../database.db"),
+    ],
+)
+def test_findings_call_a_model_s_database_by_its_place_in_the_data_set(tmp_path, model, below, up, shown):
+    folder = tmp_path / "town" / "sparse" / "0"
+    folder.mkdir(parents=True)
+    write_database((folder, *folder.parents)[up] / "database.db")
+    assert priors_of(replace(model, location=str(folder)), "auto", "", below).location == shown
 
 
 def test_cartesian_and_unsaid_systems_are_taken_as_they_are(tmp_path, model):

@@ -3,8 +3,14 @@
 import pyarrow as pa
 import pytest
 
-from sfm_audit.audit.decision.rejections import REJECTING_CODES, CountedRejections, counted, verdict_counts
-from sfm_audit.audit.table.words import Member, ReasonCode, Severity, Verdict
+from sfm_audit.audit.decision.rejections import (
+    NAMEABLE_CODES,
+    REJECTING_CODES,
+    CountedRejections,
+    counted,
+    verdict_counts,
+)
+from sfm_audit.audit.table.words import WITNESS_CODES, Member, ReasonCode, Severity, Verdict
 
 POSE, RADIAL = ReasonCode.POSE_NOT_OPTIMAL, ReasonCode.MISFIT_RADIAL
 REJECTED = {"verdict": "rejected", "severity": "medium", "reasons": ["misfit_radial: 0.4 px", "low_coverage: 8 %"]}
@@ -56,6 +62,43 @@ def test_the_rule_in_words():
     assert str(CountedRejections(at_least=Severity.HARD)).startswith("only rejections of severity hard count")
     assert CountedRejections(at_least=Severity.WEAK)
     assert CountedRejections(frozenset({POSE}))
+
+
+PRIORS, PAIRS = ReasonCode.PRIORS_DISAGREE, ReasonCode.PAIRS_DISAGREE
+LEFT_OPEN = {"verdict": "undetermined", "severity": None, "reasons": ["priors_disagree: 40 m", "low_coverage: 8 %"]}
+
+
+@pytest.mark.parametrize(
+    ("rule", "verdict"),
+    [
+        (CountedRejections(frozenset({PRIORS})), "rejected"),
+        (CountedRejections(frozenset({PRIORS, POSE})), "rejected"),
+        (CountedRejections(frozenset({POSE})), "undetermined"),
+        (CountedRejections(frozenset({PAIRS})), "undetermined"),
+        (CountedRejections(frozenset({ReasonCode.LOW_COVERAGE})), "undetermined"),  # no witness
+        (CountedRejections(frozenset({PRIORS}), Severity.WEAK), "undetermined"),  # it has no severity
+        (CountedRejections(at_least=Severity.WEAK), "undetermined"),
+    ],
+    ids=str,
+)
+def test_a_witness_that_leaves_open_rejects_where_it_is_named(rule, verdict):
+    assert rule.verdict(LEFT_OPEN) == verdict
+    assert rule.verdict({**LEFT_OPEN, "verdict": "accepted"}) == "accepted"
+
+
+def test_a_witness_that_rejects_of_itself_does_not_reject_what_is_open():
+    row = {**LEFT_OPEN, "reasons": ["pairs_disagree: 5 of 6", "misfit_radial: 0.1 px"]}
+    assert CountedRejections(frozenset({PAIRS, RADIAL})).verdict(row) == "undetermined"
+
+
+def test_the_rule_says_which_witness_rejects_by_name():
+    assert str(CountedRejections(frozenset({PRIORS, POSE}))) == (
+        "only rejections for pose_not_optimal or priors_disagree count, others are undetermined; "
+        "priors_disagree rejects what it leaves open of itself"
+    )
+    assert "of itself" not in str(CountedRejections(frozenset({PRIORS}), Severity.HARD))
+    assert {PRIORS, ReasonCode.FOLD_DISAGREES} <= set(NAMEABLE_CODES) - set(REJECTING_CODES)
+    assert set(REJECTING_CODES) | set(WITNESS_CODES.values()) == set(NAMEABLE_CODES)
 
 
 def test_only_codes_that_reject_can_be_asked_for():
