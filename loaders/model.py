@@ -188,23 +188,8 @@ class ImageRecord:
         return rotation_from_quat(self.quat_cam_from_world_wxyz)
 
     def cam_from_world(self, xyz_world: FloatArray) -> FloatArray:
-        """Move (n, 3) points from the world to the camera frame, model units.
-
-        Notes
-        -----
-        In Eigen's order of operations (v + w u + q x u with u = 2 q x v): a point at 1e-10 units from the camera centre
-        then projects to where COLMAP projects it; a matrix product would round it elsewhere.
-        """
-        w, qx, qy, qz = self.quat_cam_from_world_wxyz
-        x, y, z = xyz_world.T
-        out = np.empty(xyz_world.shape)
-        with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # what is not finite projects nowhere
-            ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
-            ux, uy, uz = ux + ux, uy + uy, uz + uz
-            out[:, 0] = x + w * ux + (qy * uz - qz * uy) + self.translation_cam_from_world[0]
-            out[:, 1] = y + w * uy + (qz * ux - qx * uz) + self.translation_cam_from_world[1]
-            out[:, 2] = z + w * uz + (qx * uy - qy * ux) + self.translation_cam_from_world[2]
-        return out
+        """Move (n, 3) points from the world to the camera frame, model units, see `moved`."""
+        return moved(self.quat_cam_from_world_wxyz, self.translation_cam_from_world, xyz_world)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -389,3 +374,23 @@ def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
     if w.ndim == 0:
         return np.array(rows)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def moved(quat_wxyz: FloatArray, translation: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Move (n, 3) points by a quaternion (4,) and a translation (3,), or each by its own: (4, n) and (3, n).
+
+    Notes
+    -----
+    In Eigen's order of operations (v + w u + q x u with u = 2 q x v): a point at 1e-10 units from the camera centre
+    then projects to where COLMAP projects it; a matrix product would round it elsewhere.
+    """
+    w, qx, qy, qz = quat_wxyz
+    x, y, z = xyz.T
+    out = np.empty(xyz.shape)
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # what is not finite projects nowhere
+        ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
+        ux, uy, uz = ux + ux, uy + uy, uz + uz
+        out[:, 0] = x + w * ux + (qy * uz - qz * uy) + translation[0]
+        out[:, 1] = y + w * uy + (qz * ux - qx * uz) + translation[1]
+        out[:, 2] = z + w * uz + (qx * uy - qy * ux) + translation[2]
+    return out

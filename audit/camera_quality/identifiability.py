@@ -99,6 +99,32 @@ def parameter_covariance(columns: FloatArray, names: tuple[str, ...], sigma_px: 
     return covariance_of_sums(names, sums, sigma_px, lambda: np.asarray(np.linalg.qr(unit.T, mode="r")))
 
 
+def parameter_covariances(
+    columns: FloatArray, names: tuple[str, ...], sigma_px: FloatArray
+) -> list[ParameterCovariance]:
+    """Return `parameter_covariance` of each of B images: columns (B, q, m), sigma_px (B,).
+
+    Images with zero columns, or whose Gram matrix leaves doubts, are left to it; the others are solved together.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        norms = np.sqrt(np.einsum("bcm,bcm->bc", columns, columns))
+        usual = (np.isfinite(norms) & (norms != 0.0)).all(axis=1) & (columns.shape[1] <= columns.shape[2])
+        chosen = np.flatnonzero(usual)
+        unit = columns[chosen] / norms[chosen, :, None]
+        values, vectors = np.linalg.eigh(unit @ unit.swapaxes(1, 2))
+        share = np.sqrt(np.maximum(values[:, 0] / values[:, -1], 0.0))
+        sure = (values[:, 0] > _SMALLEST_PIVOT * values[:, -1]) & (share > SINGULAR_SHARE)
+        root = vectors / np.sqrt(values)[:, None] * (sigma_px[chosen, None] / norms[chosen])[:, :, None]
+        covariance = root @ root.swapaxes(1, 2)
+    solved = {b: k for k, b in enumerate(chosen.tolist()) if sure[k]}
+    return [
+        ParameterCovariance(names, covariance[solved[b]], float(share[solved[b]]))
+        if b in solved
+        else parameter_covariance(columns[b], names, float(sigma_px[b]))
+        for b in range(len(columns))
+    ]
+
+
 def covariance_of_sums(
     names: tuple[str, ...], sums: ColumnSums, sigma_px: float, triangle: Callable[[], FloatArray]
 ) -> ParameterCovariance:

@@ -108,7 +108,7 @@ def camera_quality(shape: CameraShape, inliers: ImageInliers, sigma_px: float, *
     fields = candidate_fields(camera, projected)
     prepared = prepare(columns, fields, clusters=coincident_keypoints(inliers.xy_px), overwrite_fields=True)
     misfit = prepared.test(inliers.residuals_px)
-    return _quality(shape, misfit, known, depth, inliers.xy_px, sigma_px=sigma_px, grid=grid)
+    return quality_from(shape, misfit, known, depth, inliers.xy_px, sigma_px=sigma_px, grid=grid)
 
 
 def camera_quality_in_parts(
@@ -141,10 +141,10 @@ def camera_quality_in_parts(
     depth = float(np.median(np.concatenate([depths(camera, part(chosen).xyz_cam) for chosen in image.parts()])))
     misfit = image_tests_in_parts(image, int(track.max()) + 1)
     known = identifiability_of(camera, parameters)
-    return _quality(shape, misfit, known, depth, xy_px, sigma_px=sigma_px, grid=grid)
+    return quality_from(shape, misfit, known, depth, xy_px, sigma_px=sigma_px, grid=grid)
 
 
-def _quality(
+def quality_from(
     shape: CameraShape,
     misfit: MisfitTests,
     known: Identifiability,
@@ -154,6 +154,7 @@ def _quality(
     sigma_px: float,
     grid: int,
 ) -> CameraQuality:
+    """Put together what is known of an image; depth: median, model units."""
     camera, error = shape.camera, math.nan
     if math.isfinite(sigma_px) and not known.parameters.is_singular:
         error = shape.expected_error_px(known.parameters, sigma_px, depth)

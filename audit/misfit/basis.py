@@ -16,10 +16,10 @@ NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md sec
 FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection
 MAX_LEVERAGE: Final = 1.0 - 1e-9
 SMALLEST_PIVOT: Final = 1e-10  # of a Gram matrix of unit columns: below it, the exact path
-_SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
-_SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
-_SAFE_SQUARE: Final = 1e-280  # sums of squares between this and its inverse lost nothing to under- or overflow
-_MODEST_SQUARE: Final = 1e-60  # the same for squares that are multiplied with each other and with those of residuals
+SURE_FIELD: Final = 1e-10  # squared singular values above this share of the largest are kept with eight digits ..
+SURE_NULL: Final = 1e-14  # .. those below this one are rounding; in between, the exact path decides
+SAFE_SQUARE: Final = 1e-280  # sums of squares between this and its inverse lost nothing to under- or overflow
+MODEST_SQUARE: Final = 1e-60  # the same for squares that are multiplied with each other and with those of residuals
 
 
 def unit_columns(columns: FloatArray) -> FloatArray:
@@ -35,7 +35,7 @@ def column_norms(columns: FloatArray) -> FloatArray:
     """Return the lengths of the columns (c, m), without overflow; NaN where a column is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.einsum("cm,cm->c", columns, columns)
-        if _within(squares, _SAFE_SQUARE):
+        if _within(squares, SAFE_SQUARE):
             return np.asarray(np.sqrt(squares))
         largest = np.abs(columns).max(axis=1, initial=0.0)
         divisor = np.where(largest > 0, largest, 1.0)
@@ -44,7 +44,7 @@ def column_norms(columns: FloatArray) -> FloatArray:
 
 def may_stay_unscaled(sq_norms: FloatArray) -> bool:
     """Whether products of fields of these squared lengths with each other and with residuals cannot overflow."""
-    return _within(sq_norms, _MODEST_SQUARE)
+    return _within(sq_norms, MODEST_SQUARE)
 
 
 def _within(values: FloatArray, smallest: float) -> bool:
@@ -107,11 +107,11 @@ def field_transform(gram: FloatArray, before: FloatArray) -> FloatArray | None:
     """
     values, vectors = np.linalg.eigh(gram)
     upper = float(before.trace())  # the largest squared singular value lies between this / c and this
-    kept = values > _SURE_FIELD * upper
-    if (values[~kept] > _SURE_NULL * upper / len(values)).any():
+    kept = values > SURE_FIELD * upper
+    if (values[~kept] > SURE_NULL * upper / len(values)).any():
         largest = largest_sq(before)
-        kept = values > _SURE_FIELD * largest
-        if (values[~kept] > _SURE_NULL * largest).any():
+        kept = values > SURE_FIELD * largest
+        if (values[~kept] > SURE_NULL * largest).any():
             return None
     return np.asarray(vectors[:, kept] / np.sqrt(values[kept]), dtype=np.float64)
 
