@@ -36,6 +36,7 @@ COLUMNS: Final = (
 )
 POSE_SDS: Final = ("sd_rotation_deg", "sd_centre")
 _UNWRITABLE: Final = frozenset({"Cc", "Cs", "Zl", "Zp"})  # control characters, lone surrogates, line and paragraph ends
+_FORMULA: Final = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")  # full width ones too
 
 
 class Keep(StrEnum):
@@ -226,6 +227,10 @@ def quoted(name: str) -> str:
     is_plain = name and not name.startswith('"') and name == name.strip()
     if is_plain and not any(unicodedata.category(c) in _UNWRITABLE for c in name):
         return name
+    return _as_json(name)
+
+
+def _as_json(name: str) -> str:
     text = json.dumps(name, ensure_ascii=False)
     return "".join(f"\\u{ord(c):04x}" if unicodedata.category(c) in _UNWRITABLE else c for c in text)
 
@@ -247,12 +252,23 @@ def removed_text(images: Iterable[AuditedImage], extra: Iterable[Mapping[str, ob
 
 
 def csv_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """Return rows as CSV; a header line even where there is no row."""
+    """Return rows as CSV, texts as :func:`cell` has them; a header line even where there is no row."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: cell(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+def cell(value: object) -> object:
+    """Return a value as a table has it: as it is, or as a JSON string where a spreadsheet or a terminal would obey it.
+
+    A text that begins as a formula does, or that a list would not have on a line as it is; :func:`unquoted` is the way
+    back.
+    """
+    if not isinstance(value, str) or not value:
+        return value
+    return _as_json(value) if value.startswith(_FORMULA) else quoted(value)
 
 
 def as_bytes(text: str) -> bytes:

@@ -20,6 +20,7 @@ from sfm_audit.reports.errors import RunFolderError
 from sfm_audit.reports.export.selection import (
     COLUMNS,
     Keep,
+    csv_text,
     images_of_model,
     list_text,
     quoted,
@@ -136,10 +137,22 @@ def test_ordinary_names_are_written_as_they_are():
 def test_the_table_of_the_removed_holds_names_verdicts_and_reasons(tmp_path):
     run = write_run(tmp_path / "RUN", model(names=NAMES, verdicts=["rejected"] * len(NAMES)))
     rows = list(csv.DictReader(io.StringIO(removed_text(read_images(run)), newline="")))
-    assert [row["image_name"] for row in rows] == NAMES
+    assert [unquoted(row["image_name"]) for row in rows] == NAMES
     assert {row["verdict"] for row in rows} == {"rejected"}
     assert rows[0]["reasons"] == "ks_rejected: p = 0.01; other: 1, 2"
     assert (rows[0]["scene"], rows[0]["component"], rows[0]["image_id"]) == ("a", "0", "3")
+
+
+@pytest.mark.parametrize(
+    "name", ["=cmd|'/c calc'!A1", "+1+1", "-1", "@SUM(1+1)", "\t=1", "\r=1", "\uff1d1", "\x1b[31mred"]
+)
+def test_a_table_holds_nothing_that_a_spreadsheet_or_a_terminal_obeys(name):
+    text = csv_text([{"image_name": name, "index": -1}], ["image_name", "index"])
+    (row,) = csv.DictReader(io.StringIO(text))
+    assert row["image_name"].startswith('"')
+    assert unquoted(row["image_name"]) == name
+    assert row["index"] == "-1"
+    assert text.replace("\n", "").isprintable()
 
 
 def test_a_run_that_was_not_finished_is_refused(tmp_path):
