@@ -45,8 +45,9 @@ def qualities_of_joined(
 
 def _by_image(columns: FloatArray, num_images: int) -> FloatArray:
     """(B, c, 2, n) of (c, 2, B n)."""
-    by_image = columns.reshape(len(columns), 2, num_images, -1).transpose(2, 0, 1, 3)
-    return np.ascontiguousarray(by_image)
+    num_points = columns.shape[2] // num_images  # of no columns too
+    by_column = columns.reshape(len(columns), 2, num_images, num_points)
+    return np.ascontiguousarray(by_column.transpose(2, 0, 1, 3))
 
 
 def _flat(columns: FloatArray) -> FloatArray:

@@ -19,8 +19,8 @@ from sfm_audit.audit.misfit import (
     prepare,
     project_image,
 )
+from sfm_audit.audit.misfit.design import ImageDesign
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
-from sfm_audit.audit.misfit.pooled import ImageDesign
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 SIGNIFICANT: Final = 0.01

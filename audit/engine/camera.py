@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
+from sfm_audit.audit.inliers.joined import joined_inliers
 from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit import (
@@ -22,16 +24,22 @@ from sfm_audit.audit.misfit import (
     ProjectedImage,
     Retest,
     advised_camera_model,
-    camera_tests,
     image_retest,
     project_image,
     projected_design,
 )
+from sfm_audit.audit.misfit.design import Piece, piece_of
 from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, camera_tests_in_parts
+from sfm_audit.audit.misfit.pooled import camera_tests_of_pieces
+from sfm_audit.audit.misfit.pooled_stack import in_windows, pieces_of_joined
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel
+
+_MAX_JOINED: Final = 64
+"""Images with more inliers are made one by one."""
+_MAX_WINDOW: Final = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +86,24 @@ class _CameraImages:
         def pose(k: int, chosen: IntArray) -> FloatArray:
             return projected(k, chosen)[1].pose
 
-        if max(map(len, tracks), default=0) <= AT_ONCE:
-            return camera_tests(design, len(self.image_idxs), num_tracks)
+        def together(ks: list[int]) -> list[Piece]:
+            own = joined_inliers(self.model, self.residuals, self.image_idxs[ks].tolist(), len(tracks[ks[0]]))
+            seen = own.projected if camera is self.camera else project_image(camera, own.xyz_cam)
+            track = np.concatenate([tracks[k] for k in ks])
+            return pieces_of_joined(projected_design(camera, seen, own.residuals_px, track), [tracks[k] for k in ks])
+
+        def some(ahead: range) -> list[Piece]:
+            found: dict[int, Piece] = {}
+            for num_points in {len(tracks[k]) for k in ahead}:
+                alike = [k for k in ahead if len(tracks[k]) == num_points]
+                if 0 < num_points <= _MAX_JOINED and len(alike) > 1:
+                    found.update(zip(alike, together(alike), strict=True))
+            return [found[k] if k in found else piece_of(design(k)) for k in ahead]
+
+        longest = max(map(len, tracks), default=0)
+        if longest <= AT_ONCE:
+            num_images, size = len(self.image_idxs), _MAX_WINDOW if longest <= _MAX_JOINED else 1
+            return camera_tests_of_pieces(in_windows(some, num_images, size), num_images, num_tracks, exact=False)
         parted = [PartedImage(track, partial(pose, k), partial(design, k)) for k, track in enumerate(tracks)]
         return camera_tests_in_parts(parted, num_tracks)
 

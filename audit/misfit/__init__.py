@@ -12,10 +12,11 @@ from sfm_audit.audit.misfit.cause import (
     remaining_groups,
 )
 from sfm_audit.audit.misfit.clusters import coincident_keypoints
+from sfm_audit.audit.misfit.design import ImageDesign, image_design, projected_design
 from sfm_audit.audit.misfit.fields import candidate_fields
 from sfm_audit.audit.misfit.nuisance import fitted_param_idxs, nuisance_columns
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
-from sfm_audit.audit.misfit.pooled import ImageDesign, PooledTests, camera_tests, image_design, projected_design
+from sfm_audit.audit.misfit.pooled import PooledTests, camera_tests
 from sfm_audit.audit.misfit.score import PreparedImage, prepare, prepare_image
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 

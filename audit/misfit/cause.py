@@ -13,12 +13,12 @@ from sfm_audit.audit.cameras.functions import Term
 from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.misfit.capabilities import extended_params, larger_models, undistorted_model
+from sfm_audit.audit.misfit.design import ImageDesign
 from sfm_audit.audit.misfit.fields import candidate_fields
 from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, image_tests_in_parts
 from sfm_audit.audit.misfit.multiplicity import holm
 from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests
-from sfm_audit.audit.misfit.pooled import ImageDesign
 from sfm_audit.audit.misfit.score import prepare_image
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray

@@ -13,11 +13,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sfm_audit.audit.misfit import basis
+from sfm_audit.audit.misfit.design import ImageDesign, OffPose
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS
 from sfm_audit.audit.misfit.outcome import MisfitTests, judged_by_f, not_tested, refusal
 from sfm_audit.audit.misfit.pooled import (
-    ImageDesign,
-    OffPose,
     PooledNormal,
     PooledSolution,
     PooledSums,

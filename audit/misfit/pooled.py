@@ -8,37 +8,20 @@ of intrinsics and fields after each image's own pose, a second pass the scores o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from sfm_audit.audit.inliers.projected import ProjectedImage, project_image
 from sfm_audit.audit.misfit import basis
-from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
-from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
+from sfm_audit.audit.misfit.design import ImageDesign, OffPose, Piece, piece_of, remembered
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns: below it, the triangular factor by QR
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageDesign:
-    """One image of the camera.
-
-    pose: (6, 2, n) px per unit.    intrinsics: (k, 2, n) px per unit of the parameters that were fitted.
-    fields: (42, 2, n) px per unit. residuals_px: (2, n) observed minus projected.    track: (n,) 0 .. num_tracks - 1.
-    """
-
-    pose: FloatArray
-    intrinsics: FloatArray
-    fields: FloatArray
-    residuals_px: FloatArray
-    track: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,32 +32,6 @@ class PooledTests:
     num_images: int
     num_observations: int
     num_tracks: int
-
-
-def image_design(
-    camera: CameraRecord,
-    xyz_cam: FloatArray,
-    residuals_px: FloatArray,
-    track: IntArray,
-    *,
-    param_idxs: tuple[int, ...] | None = None,
-) -> ImageDesign:
-    """Return an image's part of the pooled test, from its points (n, 3) in the camera frame and residuals (2, n)."""
-    return projected_design(camera, project_image(camera, xyz_cam), residuals_px, track, param_idxs=param_idxs)
-
-
-def projected_design(
-    camera: CameraRecord,
-    projected: ProjectedImage,
-    residuals_px: FloatArray,
-    track: IntArray,
-    *,
-    param_idxs: tuple[int, ...] | None = None,
-) -> ImageDesign:
-    """Return an image's part of the pooled test, from what ``camera`` predicts for its points and residuals (2, n)."""
-    chosen = fitted_param_idxs(camera.model) if param_idxs is None else param_idxs
-    fields = candidate_fields(camera, projected)
-    return ImageDesign(projected.pose, projected.d_params[list(chosen)], fields, residuals_px, track)
 
 
 def camera_tests(
@@ -101,13 +58,22 @@ def camera_tests(
 
     Memory: 8 bytes x 42 x num_tracks for the scores, beside one image's columns.
     """
-    normal = _first_pass(designs, num_images, num_tracks)
+    return camera_tests_of_pieces(lambda i: piece_of(designs(i)), num_images, num_tracks, exact=exact)
+
+
+def camera_tests_of_pieces(
+    pieces: Callable[[int], Piece], num_images: int, num_tracks: int, *, exact: bool
+) -> PooledTests:
+    """Return `camera_tests`, from images whose poses are profiled; ``pieces`` is called as ``designs`` there."""
+    pieces = remembered(pieces)
+    normal = _first_pass(pieces, num_images, num_tracks)
     if isinstance(normal, MisfitStatus):
         return PooledTests({group: not_tested(normal) for group in GROUPS}, 0, 0, 0)
     solution = None if exact else solve_normal(normal)
     if solution is None:
-        solution = solve_triangle(triangle_of(_parts(designs, num_images), normal), normal)
-    return _second_pass(designs, num_images, num_tracks, normal, solution)
+        parts = (part for part in (pieces(i).part for i in range(num_images)) if part is not None)
+        solution = solve_triangle(triangle_of(parts, normal), normal)
+    return _second_pass(pieces, num_images, num_tracks, normal, solution)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,32 +119,6 @@ class PooledSolution:
     transform: dict[MisfitGroup, FloatArray]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OffPose:
-    """One image with its pose profiled: columns (k + 42, 2n), coordinates on the pose before (k + 42, q), y (2n,)."""
-
-    columns: FloatArray
-    coordinates: FloatArray
-    y: FloatArray
-    pose_leverage: FloatArray
-    finite: BoolArray
-
-
-def _off_pose(design: ImageDesign) -> OffPose | None:
-    """None where the pose's derivatives are not finite; other columns that are not are zeroed, and said so."""
-    pose = basis.unit_columns(design.pose.reshape(len(design.pose), -1))
-    if not np.isfinite(pose).all():
-        return None
-    q = basis.nuisance_basis(pose)
-    columns = np.concatenate([design.intrinsics, design.fields]).reshape(-1, q.shape[1])
-    finite = np.isfinite(basis.column_norms(columns))
-    columns[~finite] = 0.0
-    coordinates = basis.project_off_in_place(q, columns)
-    basis.project_off_in_place(q, columns)
-    y = basis.project_off(q, design.residuals_px.reshape(-1))
-    return OffPose(columns, coordinates, y, np.einsum("qm,qm->m", q, q), finite)
-
-
 class PooledSums:
     """The first pass, image by image."""
 
@@ -221,22 +161,21 @@ class PooledSums:
 
 
 def _first_pass(
-    designs: Callable[[int], ImageDesign], num_images: int, num_tracks: int
+    pieces: Callable[[int], Piece], num_images: int, num_tracks: int
 ) -> PooledNormal | Literal[MisfitStatus.NO_FIELDS, MisfitStatus.NOT_FINITE, MisfitStatus.NOT_ENOUGH_EVIDENCE]:
     """Accumulate over images; or say why nothing can be tested."""
     sums: PooledSums | None = None
     for i in range(num_images):
-        design = designs(i)
-        if not len(design.fields):
+        piece = pieces(i)
+        if not piece.has_fields:
             return MisfitStatus.NO_FIELDS
-        if not len(design.track):
+        if not len(piece.track):
             continue
-        part = _off_pose(design)
-        if part is None or not part.finite[: len(design.intrinsics)].all():
+        if piece.part is None or not piece.part.finite[: piece.num_intrinsics].all():
             return MisfitStatus.NOT_FINITE
-        sums = sums or PooledSums(len(design.intrinsics), num_tracks)
-        sums.add(part, design.track)
-        del design, part  # before the next image's columns are made
+        sums = sums or PooledSums(piece.num_intrinsics, num_tracks)
+        sums.add(piece.part, piece.track)
+        del piece  # before the next image's columns are made
     if sums is None:
         return MisfitStatus.NOT_ENOUGH_EVIDENCE
     return sums.normal() if np.isfinite(sums.before).all() else MisfitStatus.NOT_FINITE
@@ -281,15 +220,6 @@ def triangle_of(parts: Iterable[OffPose], normal: PooledNormal) -> FloatArray:
     return triangle
 
 
-def _parts(designs: Callable[[int], ImageDesign], num_images: int) -> Iterator[OffPose]:
-    """Image by image, without those that have no observations."""
-    for i in range(num_images):
-        design = designs(i)
-        part = _off_pose(design) if len(design.track) else None
-        if part is not None:
-            yield part
-
-
 def solve_triangle(triangle: FloatArray, normal: PooledNormal) -> PooledSolution:
     """Solve as the dense problem is solved, with the triangle in the place of the columns."""
     k = normal.num_intrinsics
@@ -312,7 +242,7 @@ def solve_triangle(triangle: FloatArray, normal: PooledNormal) -> PooledSolution
 
 
 def _second_pass(
-    designs: Callable[[int], ImageDesign],
+    pieces: Callable[[int], Piece],
     num_images: int,
     num_tracks: int,
     normal: PooledNormal,
@@ -322,16 +252,13 @@ def _second_pass(
     per_track, scores = np.zeros((num_tracks, NUM_FIELDS)), np.zeros(NUM_FIELDS)
     last_row = np.empty(num_tracks, dtype=np.int64)
     for i in range(num_images):
-        design = designs(i)
-        part = _off_pose(design) if len(design.track) else None
-        if part is None:
+        piece = pieces(i)
+        if piece.part is None:
             continue
-        track = design.track
-        del design
-        own_scores, per_observation = scored(part, normal, solution)
+        own_scores, per_observation = scored(piece.part, normal, solution)
         scores += own_scores
-        add_rows(per_track, track, per_observation, last_row)
-        del part, per_observation  # before the next image's columns are made
+        add_rows(per_track, piece.track, per_observation, last_row)
+        del piece, per_observation  # before the next image's columns are made
     meat = per_track.T @ per_track
     tests = {group: judged(group, scores, meat, normal, solution) for group in GROUPS}
     return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)

@@ -10,19 +10,26 @@ from joint_reference import SPEC, model_of
 from numpy.testing import assert_array_equal
 
 from sfm_audit.audit.camera_quality.identifiability import parameter_covariance, parameter_covariances
+from sfm_audit.audit.camera_quality.joined import qualities_of_joined
 from sfm_audit.audit.camera_quality.measure import CameraShape, camera_quality
+from sfm_audit.audit.cameras import project_columns
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.engine.quality import quality_of_images
-from sfm_audit.audit.inliers.projected import image_inliers
+from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.misfit import candidate_fields, nuisance_columns, prepare
 from sfm_audit.audit.misfit.untestable import MAX_POINTS, untestable_tests
+from sfm_audit.audit.table.words import MisfitStatus
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 GRID = 8
 
 
 @pytest.fixture(scope="module", params=[5, 9])
 def auditor(request):
-    return ModelAuditor(model_of(dataclasses.replace(SPEC, num_images=60, points_per_image=request.param), seed=5))
+    return ModelAuditor(
+        model_of(dataclasses.replace(SPEC, num_images=60, points_per_image=request.param, shared_camera=True), seed=5)
+    )
 
 
 def test_few_inliers_together_are_each_by_itself(auditor):
@@ -41,6 +48,19 @@ def test_few_inliers_together_are_each_by_itself(auditor):
         assert own.parameters.names == expected.parameters.names
         assert_array_equal(own.sd_focal_rel, expected.sd_focal_rel)
         assert_array_equal(own.parameters.covariance, expected.parameters.covariance)
+
+
+def test_panoramas_with_few_inliers_have_no_fields_together_either():
+    panorama = CameraRecord(1, BY_NAME["EQUIRECTANGULAR"], 2000, 1000, np.array([2000.0, 1000.0]))
+    own = np.random.default_rng(0).normal(size=(3 * 6, 3))
+    projected = project_columns(panorama.model, panorama.params, own)
+    image = ImageRecord(1, "1.jpg", 1, panorama, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), 6)
+    extra, noise = np.empty((0, 2, len(own))), np.full((2, len(own)), 0.1)
+    xy_px = np.ascontiguousarray((projected.xy_px + noise).T)
+    joined = ImageInliers(image, panorama, xy_px, own, noise, np.asfortranarray(own), projected.d_xy_d_cam, extra)
+    found = qualities_of_joined(CameraShape.of(panorama), joined, np.full(3, 0.5), grid=GRID)
+    assert {test.status for each in found for test in each.misfit.values()} == {MisfitStatus.NO_FIELDS}
+    assert [each.identifiability.has_focal for each in found] == [False] * 3
 
 
 def columns_of(auditor, num_points, images=range(12)):
