@@ -5,6 +5,7 @@ import pytest
 from report_samples import NASTY_NAMES, browser, needs_chromium, read_sample, screenshot_folder, write_run
 
 from sfm_audit.audit.cli.main import main
+from sfm_audit.audit.table.words import Member, Reason, ReasonCode
 from sfm_audit.reports import html
 from sfm_audit.reports.charts.scene import SceneView
 from sfm_audit.reports.text.wording import plain
@@ -22,7 +23,9 @@ def chromium():
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    content = html.read_content(read_sample(folder / "RUN", 60, names=NASTY_NAMES))
+    against = [Reason(ReasonCode.PRIORS_DISAGREE, Member.OUTSIDE, "40 m")]
+    said = {"witnesses": [["priors"]] * 60, "reason_details": [against] * 5 + [[]] * 55}
+    content = html.read_content(read_sample(folder / "RUN", 60, names=NASTY_NAMES, **said))
     pictures = [html.ImagePictures(missing="No pictures: a test.")] * 3
     views = [html.ModelView(content.rows[0]["part"], "a/0", ring(60))]
     path = folder / "report.html"
@@ -113,6 +116,13 @@ def test_the_panel_of_an_image_and_back(page):
     page.keyboard.press("Escape")
     dialog.wait_for(state="hidden")
     assert page.evaluate("document.activeElement.textContent") == NASTY_NAMES[0]
+
+
+def test_a_witness_leads_to_the_images_it_speaks_against(page):
+    links = page.locator("[aria-labelledby=witnesses] a.open")
+    assert links.all_inner_texts() == [plain(name) for name in NASTY_NAMES[:5]]
+    links.nth(2).click()
+    assert page.locator("#panel-title").inner_text() == NASTY_NAMES[2]
 
 
 def test_from_the_panel_to_the_pictures(page):
