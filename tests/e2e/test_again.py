@@ -90,6 +90,8 @@ def test_filter_by_reason_and_severity(runs):
     assert all("misfit_radial" in line for line in removed)
     assert main(["filter", run, "--severity", "hard", "--list", "hard"]) == 0
     assert len(Path("hard.removed.csv").read_text(encoding="utf-8").splitlines()[1:]) == 2
+    assert main(["filter", run, "--reason", "priors_disagree", "--list", "priors"]) == 0  # a witness that nobody asked
+    assert len(Path("priors.removed.csv").read_text(encoding="utf-8").splitlines()[1:]) == 0
 
 
 def test_check_judges_under_the_settings_asked_for(runs, capsys):
