@@ -117,8 +117,10 @@ def test_tables_keep_everything_but_the_verdict_and_are_counted():
         }
     )
     assert counted(table, CountedRejections()) is table
+    of_pose = counted(table, CountedRejections(frozenset({POSE})))
     narrow = counted(table, CountedRejections(at_least=Severity.HARD))
     assert narrow.column("verdict").to_pylist() == ["rejected", "undetermined", "accepted"]
+    assert of_pose.equals(narrow)
     assert narrow.drop_columns(["verdict"]).equals(table.drop_columns(["verdict"]))
     counts = verdict_counts(narrow)
     assert (counts["num_rejected"], counts["num_undetermined"], counts["num_accepted"]) == (1, 1, 1)
