@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from functools import partial
 from typing import Final, cast
@@ -34,6 +35,7 @@ VERBS: Final = {
 
 _SIGNALS: Final = {"SIGTERM": ExitCode.TERMINATED, "SIGHUP": ExitCode.HANGUP}
 _GOES_ON: Final = "what was finished stays, the same command goes on"
+_NO_MEMORY: Final = "there is not enough memory for this; name less at a time, or give the process more memory"
 _WORDS: Final = {
     ExitCode.INTERRUPTED: f"interrupted; {_GOES_ON}",
     ExitCode.TERMINATED: f"ended by SIGTERM; {_GOES_ON}",
@@ -102,6 +104,9 @@ def _answer(args: Sequence[str]) -> int:
         return _refuse(_WORDS[ExitCode.INTERRUPTED], ExitCode.INTERRUPTED)
     except Ended as ended:
         return _refuse(_WORDS[ended.exit_code], ended.exit_code)
+    except MemoryError:
+        LOGGER.exception("out of memory")
+        return _refuse(_NO_MEMORY, ExitCode.AUDIT_STOPPED)
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         advice = f" (see {context.command_path} --help)" if context else ""
@@ -115,7 +120,12 @@ def entry_point() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores SIGHUP, and so do we
             signal.signal(number, partial(_end, code))
-    sys.exit(main(sys.argv[1:]))
+    try:
+        exit_code = main(sys.argv[1:])
+    except Exception:  # noqa: BLE001 - a bug; Python's own exit code for it, 1, would say that a gate failed
+        traceback.print_exc()
+        exit_code = int(ExitCode.AUDIT_STOPPED)
+    sys.exit(exit_code)
 
 
 def _end(code: ExitCode, number: int, frame: object) -> None:

@@ -37,6 +37,7 @@ MATRICES: Final = ("overlap_matrix", "scale_ratio_matrix")
 
 _SUFFIX: Final = ".npy"
 _ZIP_MAGIC: Final = b"PK\x03\x04"
+_MAX_PICKLE_BYTES: Final = 4 * 2**30  # a pickle is read as a whole; those of MegaDepth have some 100 MB
 _EXPANSION: Final = (64 << 20, 64)  # bytes of all members once decompressed: this much, and so many times the file
 _NPY_LENGTHS: Final = {b"\x93NUMPY\x01\x00": "<H", b"\x93NUMPY\x02\x00": "<I"}
 _NPY_HEADER: Final = re.compile(
@@ -92,6 +93,7 @@ def read_scene_info(path: str | Path) -> SceneInfo:
             if file.peek(len(_ZIP_MAGIC)).startswith(_ZIP_MAGIC):
                 members, values = _read_npz(file, num_bytes)
                 return _scene_info("npz", values, members=members)
+            _check_pickle_size(num_bytes)
             inert = load_inert(file.read())
         return _scene_info("pickle", inert.value, protocol=inert.protocol, numpy_core=inert.numpy_core)
     except RefusedPickleError as error:
@@ -101,6 +103,11 @@ def read_scene_info(path: str | Path) -> SceneInfo:
         wanted = "LoFTR's or D2-Net's scene_info"
         advice = "name a scene_info file of MegaDepth"
         raise MalformedFileError(str(path), None, wanted, str(error), advice) from error
+
+
+def _check_pickle_size(num_bytes: int) -> None:
+    if num_bytes > _MAX_PICKLE_BYTES:
+        raise RefusedPickleError(f"a pickle of {num_bytes} bytes, more than {_MAX_PICKLE_BYTES}")
 
 
 class _NotSceneInfoError(Exception):

@@ -100,6 +100,22 @@ def test_an_unknown_error_keeps_its_traceback(raising):
         main.main(["demo"])
 
 
+def test_the_exit_code_of_a_bug_is_not_that_of_a_gate_that_failed(raising, monkeypatch, capsys):
+    raising(ZeroDivisionError("a bug"))
+    monkeypatch.setattr(main, "_SIGNALS", {})
+    monkeypatch.setattr(sys, "argv", ["sfm-audit", "demo"])
+    with pytest.raises(SystemExit) as end:
+        main.entry_point()
+    assert end.value.code == 5
+    assert "ZeroDivisionError: a bug" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_one_line_and_5(raising, capsys):
+    raising(MemoryError())
+    assert main.main(["demo"]) == 5
+    assert capsys.readouterr().err == f"sfm-audit: {main._NO_MEMORY}\n"
+
+
 def test_output_that_the_terminal_cannot_show_is_shown_by_code():
     code = "from sfm_audit.audit.cli.terminal import print_page; print_page('Zürich 東')"
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -4,6 +4,7 @@ Nothing here is ever given to Python's own unpickler.
 """
 
 import io
+import os
 import resource
 import struct
 import time
@@ -115,6 +116,15 @@ def archive(path: Path, members: dict[str, bytes]) -> Path:
         for name, content in members.items():
             out.writestr(name, content)
     return path
+
+
+@pytest.mark.parametrize("head", [b"", b"\x80\x04"], ids=["zeros", "pickle"])
+def test_a_file_of_200_gb_is_not_read(tmp_path: Path, head: bytes):
+    path = tmp_path / "s.pickle"
+    path.write_bytes(head)
+    os.truncate(path, 200 * 2**30)
+    with pytest.raises(LoadError, match="a pickle of 214748364800 bytes, more than"):
+        read_scene_info(path)
 
 
 def test_an_archive_that_grows_is_refused_before_it_does(tmp_path: Path):
