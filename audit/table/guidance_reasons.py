@@ -218,12 +218,14 @@ REASON_GUIDANCE: Final[dict[ReasonCode, Guidance]] = {
     ),
     ReasonCode.REFERENCE_DISAGREES: Guidance(
         "A pose that is wrong, a reference of another frame, time or scale, an alignment that one outlier pulled.",
-        "Compare the neighbours: if all are off by the same, the alignment is; if one is, its pose.",
+        "Compare the neighbours: if all are off by the same, the alignment is; if one is, its pose. Who trusts the "
+        "reference leaves such images out with `sfm-audit filter RUN --reason reference_disagrees --list kept.txt`.",
         "That the reference is the truth.",
     ),
     ReasonCode.PRIORS_DISAGREE: Guidance(
         "A GPS reading under trees or between walls, a wrong lever arm, a pose that is wrong.",
-        "Look at the sd that the prior claims first, then at the images around.",
+        "Look at the sd that the prior claims first, then at the images around. Who trusts the priors leaves such "
+        "images out with `sfm-audit filter RUN --reason priors_disagree --list kept.txt`.",
         "That the prior is the truth.",
     ),
 }
