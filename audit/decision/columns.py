@@ -13,7 +13,8 @@ from sfm_audit.audit.table.words import Member
 
 CAUSE_COLUMNS: Final = ("misfit_group", "misfit_px", "misfit_q")
 WORTH_COLUMNS: Final = ("misfit_px_sigma", "misfit_worth_deg", "misfit_worth_centre", "misfit_worth_focal_rel")
-VERDICT_COLUMNS: Final = ("verdict", *(str(member) for member in Member), "severity", "reasons", "reason_details")
+_MEMBERS: Final = tuple((member, str(member)) for member in Member)
+VERDICT_COLUMNS: Final = ("verdict", *(name for _, name in _MEMBERS), "severity", "reasons", "reason_details")
 
 
 def cause_columns(misfit: MisfitDecision | None) -> dict[str, object]:
@@ -40,7 +41,7 @@ def verdict_columns(decision: Decision) -> dict[str, object]:
     """Return the verdicts, the severity and the reasons."""
     return {
         "verdict": str(decision.verdict),
-        **{str(member): decision.of(member) for member in Member},
+        **{name: decision.of(member) for member, name in _MEMBERS},
         "severity": decision.severity,
         "reasons": [str(reason) for reason in decision.reasons],
         "reason_details": decision.all_reasons,

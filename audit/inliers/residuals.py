@@ -11,7 +11,7 @@ from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
 from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_differentiable, is_sane, is_usable
 from sfm_audit.audit.inliers.stationarity import pose_offset_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel, rotation_from_quat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +165,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     pose_offset = np.full(num_images, np.nan)
     d_extra: list[FloatArray] = []
     counts = np.zeros((4, num_images), dtype=np.int64)
+    rotations = rotation_from_quat(model.images.quat_cam_from_world_wxyz)
     for image_idx in range(num_images):
         image, linked = model.image(image_idx), slice(*observations.offsets[image_idx : image_idx + 2])
         point_idx = observations.point_idx[linked]
@@ -173,7 +174,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         offsets[image_idx + 1] = own.stop
         np.add(part.inlier_row, linked.start, out=observation_row[own])
         residuals[:, own] = part.residuals_px
-        jacobian[:, :, own] = image.rotation_cam_from_world.T @ part.jacobian_cam
+        jacobian[:, :, own] = rotations[image_idx].T @ part.jacobian_cam
         pose_offset[image_idx] = part.pose_offset_px
         d_extra.append(part.d_extra)
         counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite, part.num_unprojected

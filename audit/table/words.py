@@ -386,8 +386,7 @@ def strongest(verdicts: Iterable[str | None]) -> Verdict:
 
     Undetermined where nothing was asked, and where a table holds another word.
     """
-    words = set(Verdict)
-    said = [Verdict(each) if each in words else Verdict.UNDETERMINED for each in verdicts if each is not None]
+    said = [Verdict(each) if each in VERDICT_ORDER else Verdict.UNDETERMINED for each in verdicts if each is not None]
     return min(said, key=VERDICT_ORDER.__getitem__, default=Verdict.UNDETERMINED)
 
 
