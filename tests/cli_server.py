@@ -5,6 +5,7 @@ with CliServer() as cli:
 """
 
 import importlib
+import itertools
 import json
 import os
 import resource
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -52,10 +53,11 @@ class CliServer:
         env: Mapping[str, str] | None = None,
         seconds: float = 60.0,
         address_space: float = 6.0,
+        kill_at: int | None = None,
     ) -> Answer:
-        """Run one command; address_space in GB."""
+        """Run one command; address_space in GB; kill_at: it dies before so many renamings and flushings of files."""
         request = {"args": [os.fspath(arg) for arg in args], "cwd": os.path.abspath(cwd), "env": dict(env or {})}  # noqa: PTH100
-        request |= {"seconds": seconds, "address_space": int(address_space * GIGABYTE)}
+        request |= {"kill_at": kill_at, "seconds": seconds, "address_space": int(address_space * GIGABYTE)}
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(request) + "\n")
@@ -91,6 +93,8 @@ def _become(request: dict[str, Any], out: int, err: int) -> None:
         os.environ.update(request["env"])
         resource.setrlimit(resource.RLIMIT_AS, (request["address_space"],) * 2)
         sys.argv = ["sfm-audit", *request["args"]]
+        if request["kill_at"] is not None:
+            _die_at(request["kill_at"])
         from sfm_audit.audit.cli.main import entry_point  # noqa: PLC0415 - imported already
 
         entry_point()
@@ -102,6 +106,22 @@ def _become(request: dict[str, Any], out: int, err: int) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+def _die_at(number: int) -> None:
+    """Kill this process before the renaming or flushing of that number, counted from 0."""
+    left = itertools.count(number, -1)
+
+    def dying(call: Callable[..., Any]) -> Callable[..., Any]:
+        def or_die(*args: Any, **options: Any) -> Any:
+            if next(left) == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*args, **options)
+
+        return or_die
+
+    Path.replace = dying(Path.replace)
+    os.fsync = dying(os.fsync)
 
 
 def _wait(pid: int, seconds: float) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.audit.cli.gate_file import read_gate_file
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.cli.toml_file import MAX_DEPTH, MAX_KEY_PARTS, MAX_KEYS, read_toml
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.reports.compare.gate_policy import Band, Limits
 
 BOMBS = {
     "nested": ("a = " + "[" * 20000 + "1" + "]" * 20000, "nested more than 20 deep"),
@@ -67,6 +69,51 @@ def test_absurd_values_are_bounded(tmp_path, text, words):
         read_config(file, {})
     assert words in str(caught.value)
     assert len(str(caught.value)) < 600
+
+
+STRANGE = (
+    "nan",
+    "-inf",
+    "-1",
+    "1e308",
+    "9" * 300,
+    "''",
+    "[]",
+    "[[1]]",
+    "{a = 1}",
+    "1979-05-27",
+    "'\\n\\u001b[31m'",
+    '"\\u202e"',
+)
+SECTIONS = {"limits": Limits, "band": Band}
+GATE_KEYS = [f"{section}.{key}" for section, model in SECTIONS.items() for key in model.model_fields]
+
+
+@pytest.mark.parametrize("value", STRANGE, ids=range(len(STRANGE)))
+def test_no_key_takes_what_it_should_not(tmp_path, value):
+    """Each key of config and gate files: a short line that names it, or a value that can be calculated with."""
+    file = tmp_path / "strange.toml"
+    read_settings, read_gate = readers(file)
+    keys = dict.fromkeys(AuditConfig.model_fields, read_settings) | dict.fromkeys(GATE_KEYS, read_gate)
+    for key, read in keys.items():
+        file.write_text(f"{key} = {value}\n", encoding="utf-8")
+        if (line := said(read)) is None:
+            numbers = key.startswith(("limits.", "band.")) and value in {"1e308", "9" * 300}
+            texts = key in {"database", "reference", "priors"} and value.startswith(("'\\", '"'))
+            assert numbers or texts, (key, value)
+        else:
+            assert key.rpartition(".")[2] in line, line
+            assert "\n" not in line, key
+            assert len(line) < 600, key
+
+
+def said(read):
+    """The line that refuses, None where nothing does."""
+    try:
+        read()
+    except KnownError as error:
+        return str(error) if error.exit_code == ExitCode.USAGE else f"exit code {error.exit_code}"
+    return None
 
 
 @pytest.mark.parametrize("kind", ["pipe", "zero", "folder"])
