@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -48,6 +50,16 @@ class LoadError(Exception):
 
 def _bounded(part: str) -> str:
     return part if len(part) <= _MAX_PART else f"{part[:_MAX_PART]}..."
+
+
+@contextmanager
+def called(name: str) -> Iterator[None]:
+    """While errors are raised here, the file is called so, not by its path on this machine."""
+    try:
+        yield
+    except LoadError as error:
+        error.path, error.args = name, (name, *error.args[1:])
+        raise
 
 
 class MissingFileError(LoadError):

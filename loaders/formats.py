@@ -178,20 +178,20 @@ def keypoint_scales_of(model: SparseModel, shown_as: str) -> FloatArray:
     return scales(model, shown_as)
 
 
-def verified_pairs_of(model: SparseModel, database: str | None, shown_as: str) -> PairSource | None:
+def verified_pairs_of(model: SparseModel, database: str | None, shown_as: str, below: str = "") -> PairSource | None:
     """Return the verified pairs of a model; None where no database was named.
 
     Parameters
     ----------
     database : its location, or ``auto``: the one that belongs to the model, where there is one
-    shown_as : the model's location for messages
+    shown_as : the model's location for messages            below : its path below what the user gave, with slashes
 
     Raises
     ------
     LoadError
         The named database cannot be read, or does not fit the model.
     """
-    return None if database is None else database_pairs(model, database, shown_as)
+    return None if database is None else database_pairs(model, database, shown_as, below)
 
 
 def _incomplete(folder: InputPath, there: tuple[str, ...]) -> MissingFileError:

@@ -128,7 +128,7 @@ def _given(task: Task, model: SparseModel) -> Given:
     """Read what the settings name besides the model; LoadError where that cannot be read."""
     config, ref = task.config, task.ref
     return Given(
-        verified_pairs_of(model, config.database, ref.model_path),
+        verified_pairs_of(model, config.database, ref.model_path, ref.below),
         reference_of(model, config.reference, ref.below, ref.scene) if config.reference is not None else None,
         priors_of(model, config.priors, ref.model_path, ref.below) if config.priors is not None else None,
     )

@@ -6,6 +6,8 @@ rows, cols, data), data = rows x cols float32, row-major, little-endian.
 
 from __future__ import annotations
 
+import os
+import posixpath
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -70,6 +72,17 @@ def find_database(model_location: str | Path) -> Path | None:
         if exists(path):
             return path
     return None
+
+
+def name_of_database(path: Path, model_location: str, below: str) -> str:
+    """Return how findings call the database of a model, with slashes.
+
+    Parameters
+    ----------
+    path : of `find_database`            below : the path of the model below what the user gave; the name begins there,
+        or at the model where that was given
+    """
+    return posixpath.normpath(posixpath.join(below, Path(os.path.relpath(path, model_location)).as_posix()))
 
 
 def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes:

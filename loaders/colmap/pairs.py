@@ -23,12 +23,13 @@ from sfm_audit.loaders.colmap.database import (
     check_database,
     find_database,
     malformed,
+    name_of_database,
     rows_by_name,
     stored_keypoints,
 )
 from sfm_audit.loaders.colmap.sqlite_guard import PAIR_TABLES, open_database
-from sfm_audit.loaders.errors import LoadError, MissingFileError
-from sfm_audit.loaders.model import MatchedPair, SparseModel
+from sfm_audit.loaders.errors import LoadError, MissingFileError, called
+from sfm_audit.loaders.model import MatchedPair, PairSource, SparseModel
 
 AUTO: Final = "auto"
 MAX_IMAGES: Final = 2147483647
@@ -160,13 +161,30 @@ class RefusedPairs:
         raise self._reason
 
 
-def database_pairs(model: SparseModel, database: str, shown_as: str) -> DatabasePairs | RefusedPairs:
+class _PairsOfModel:
+    """Those of the database that belongs to a model; errors call it by its place in the data set."""
+
+    def __init__(self, source: PairSource, name: str) -> None:
+        self._source, self._name = source, name
+
+    def pairs(self) -> Iterator[MatchedPair]:
+        """Go through the pairs."""
+        with called(self._name):
+            yield from self._source.pairs()
+
+    def keypoints_px(self, image_idx: int) -> FloatArray:
+        """Return (num_points2d, 2) the 2D points of an image, px."""
+        with called(self._name):
+            return self._source.keypoints_px(image_idx)
+
+
+def database_pairs(model: SparseModel, database: str, shown_as: str, below: str = "") -> PairSource:
     """Return the verified pairs of a model.
 
     Parameters
     ----------
     database : its location, or ``auto``: the ``database.db`` beside the model or up to three folders above it
-    shown_as : the model's location for messages
+    shown_as : the model's location for messages            below : its path below what the user gave, with slashes
 
     Raises
     ------
@@ -180,6 +198,8 @@ def database_pairs(model: SparseModel, database: str, shown_as: str) -> Database
         if path is None:
             wanted = "a database.db beside the model or up to three folders above it"
             raise MissingFileError(shown_as, None, wanted, "none", "name it with --database")
-        return DatabasePairs(path, model)
+        name = name_of_database(path, model.location, below)
+        with called(name):
+            return _PairsOfModel(DatabasePairs(path, model), name)
     except LoadError as error:
         return RefusedPairs(error)

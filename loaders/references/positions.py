@@ -9,17 +9,15 @@ with # are comments.
 from __future__ import annotations
 
 import csv
-import os
-import posixpath
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
-from sfm_audit.loaders.colmap.database import find_database
+from sfm_audit.loaders.colmap.database import find_database, name_of_database
 from sfm_audit.loaders.colmap.priors import CARTESIAN, NOT_SAID, WGS84, StoredPriors, read_stored_priors
-from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileError
+from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileError, called
 from sfm_audit.loaders.evidence import NotAsked, PositionPriors
 from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.paths.files import open_input, reading
@@ -68,14 +66,11 @@ def priors_of(model: SparseModel, priors: str, shown_as: str, below: str = "") -
         if path is None:
             wanted = "a database.db beside the model or up to three folders above it"
             raise MissingFileError(shown_as, None, wanted, "none", "name it with --priors")
-        return _of_images(model, path, _shown(path, model.location, below))
+        name = name_of_database(path, model.location, below)
+        with called(name):
+            return _of_images(model, path, name)
     except LoadError as error:
         return NotAsked(str(error))
-
-
-def _shown(path: Path, location: str, below: str) -> str:
-    """Return how findings call the database of a model: from the data set, or else from the model."""
-    return posixpath.normpath(posixpath.join(below, Path(os.path.relpath(path, location)).as_posix()))
 
 
 def _of_images(model: SparseModel, path: InputPath, shown: str | None = None) -> PositionPriors | NotAsked:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from contextlib import closing
 
@@ -161,6 +162,24 @@ def test_auto_without_a_database_says_so_when_it_is_asked(model):
     for question in (refused.pairs, lambda: refused.keypoints_px(0)):
         with pytest.raises(LoadError, match=r"the scene: expected a database\.db beside the model"):
             question()
+
+
+def test_errors_call_a_model_s_own_database_by_its_place_and_a_named_one_as_it_was_given(model, path):
+    changed(path, ("UPDATE keypoints SET data = ?", ((XY["a.jpg"] + 7).tobytes(),)))
+    at = model.images.name.index("a.jpg")
+    below = "sparse/0"
+    shown = {"": "../../database.db", below: "database.db", f"photos/{below}": "photos/database.db"}
+    for given, name in shown.items():
+        with pytest.raises(LoadError, match=f"^{name}: expected the 2D points of 'a.jpg'"):
+            database_pairs(model, "auto", "scene", given).keypoints_px(at)
+    with pytest.raises(LoadError, match=f"^{re.escape(str(path))}: expected the 2D points"):
+        database_pairs(model, str(path), "scene", below).keypoints_px(at)
+    changed(path, ("UPDATE two_view_geometries SET cols = 3", ()))
+    with pytest.raises(LoadError, match=r"^database\.db: expected matches of pair"):
+        list(database_pairs(model, "auto", "scene", below).pairs())
+    changed(path, ("UPDATE images SET name = 'other.jpg' WHERE name = 'a.jpg'", ()))
+    with pytest.raises(LoadError, match=r"^database\.db: expected the image 'a.jpg'"):
+        database_pairs(model, "auto", "scene", below).keypoints_px(at)
 
 
 def test_a_named_database_has_to_be_there(model, tmp_path):
