@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
 from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
 from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_differentiable, is_sane, is_usable
-from sfm_audit.audit.inliers.stationarity import pose_offset_px
+from sfm_audit.audit.inliers.stationarity import pose_offset_px, pose_offsets_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel, rotation_from_quat
+
+_MAX_JOINED: Final = 64
+_MAX_WAITING: Final = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +158,36 @@ def longest_px(residuals_px: FloatArray) -> float:
     return float(np.sqrt((residuals_px**2).sum(axis=0).max(initial=0.0)))
 
 
+class _PoseOffsets:
+    """Takes the pose offsets of small images of one size together, of others at once."""
+
+    def __init__(self, offset_px: FloatArray) -> None:
+        self._offset_px = offset_px
+        self._waiting: dict[int, list[tuple[int, ImageResiduals]]] = {}
+
+    def add(self, image_idx: int, part: ImageResiduals) -> None:
+        """Take an image."""
+        size = part.inlier_row.size
+        if not 0 < size <= _MAX_JOINED:
+            self._offset_px[image_idx] = part.pose_offset_px
+            return
+        alike = self._waiting.setdefault(size, [])
+        alike.append((image_idx, part))
+        if len(alike) == _MAX_WAITING:
+            self._ask(self._waiting.pop(size))
+
+    def flush(self) -> None:
+        """Take what is left."""
+        for alike in self._waiting.values():
+            self._ask(alike)
+        self._waiting.clear()
+
+    def _ask(self, alike: list[tuple[int, ImageResiduals]]) -> None:
+        parts = [(part.residuals_px, part.jacobian_cam, part.xyz_cam) for _, part in alike]
+        with np.errstate(all="ignore"):
+            self._offset_px[[image_idx for image_idx, _ in alike]] = pose_offsets_px(parts)
+
+
 def model_residuals(model: SparseModel) -> ModelResiduals:
     """Return the inliers of all images with their residuals; one pass over the images, arrays throughout."""
     observations = model.observations
@@ -163,6 +197,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     residuals = np.empty((2, capacity))
     jacobian = np.empty((2, 3, capacity))
     pose_offset = np.full(num_images, np.nan)
+    waiting = _PoseOffsets(pose_offset)
     d_extra: list[FloatArray] = []
     counts = np.zeros((4, num_images), dtype=np.int64)
     rotations = rotation_from_quat(model.images.quat_cam_from_world_wxyz)
@@ -175,9 +210,10 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         np.add(part.inlier_row, linked.start, out=observation_row[own])
         residuals[:, own] = part.residuals_px
         jacobian[:, :, own] = rotations[image_idx].T @ part.jacobian_cam
-        pose_offset[image_idx] = part.pose_offset_px
+        waiting.add(image_idx, part)
         d_extra.append(part.d_extra)
         counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite, part.num_unprojected
+    waiting.flush()
     total = offsets[-1]
     observation_row = observation_row[:total]
     inlier_point = observations.point_idx if total == capacity else observations.point_idx[observation_row]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -79,3 +80,40 @@ def offset_px(columns: FloatArray, residuals_px: FloatArray) -> float:
         basis, singular, _ = np.linalg.svd(columns[used].T / norms, full_matrices=False)
         projected = basis[:, singular > 1e-9 * singular[0]].T @ y
     return float(np.sqrt(projected @ projected / n))
+
+
+def pose_offsets_px(parts: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> list[float]:
+    """Return `pose_offset_px` of several images with equally many observations, to the last bit.
+
+    Parameters
+    ----------
+    parts : residuals (2, n), Jacobian (2, 3, n) and points (n, 3) of each
+
+    Notes
+    -----
+    Images whose columns are not all well above rounding are left to it.
+    """
+    num_images, num_points = len(parts), parts[0][0].shape[1]
+    if not num_points or num_images == 1:
+        return [pose_offset_px(*part) for part in parts]
+    residuals, jacobians, points = zip(*parts, strict=True)
+    joined = pose_columns(np.concatenate(jacobians, axis=2), np.concatenate(points))
+    by_image = np.ascontiguousarray(joined.reshape(6, 2, num_images, num_points).transpose(2, 0, 1, 3))
+    columns = by_image.reshape(num_images, 6, 2 * num_points)
+    gram = columns @ columns.swapaxes(1, 2)
+    squares = np.diagonal(gram, axis1=1, axis2=2)
+    if not np.isfinite(gram).all() or not (squares > 0).all():
+        return [pose_offset_px(*part) for part in parts]
+    norms = np.sqrt(squares)
+    y = np.stack(residuals).reshape(num_images, 2 * num_points, 1)
+    right = (columns @ y)[:, :, 0] / norms
+    try:
+        factor = np.linalg.cholesky(gram / norms[:, None, :] / norms[:, :, None])
+    except np.linalg.LinAlgError:
+        return [pose_offset_px(*part) for part in parts]
+    is_sure = np.diagonal(factor, axis1=1, axis2=2).min(axis=1) ** 2 > _SMALLEST_PIVOT
+    projected = np.linalg.solve(factor, right[:, :, None])[:, :, 0]
+    return [
+        math.sqrt(own @ own / num_points) if sure else pose_offset_px(*part)
+        for own, sure, part in zip(projected, is_sure.tolist(), parts, strict=True)
+    ]
