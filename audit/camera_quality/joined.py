@@ -7,6 +7,7 @@ import numpy as np
 from sfm_audit.audit.camera_quality.expected_error import depths
 from sfm_audit.audit.camera_quality.identifiability import fitted_names, identifiability_of, parameter_covariances
 from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, quality_from
+from sfm_audit.audit.inliers.joined import by_image, flat
 from sfm_audit.audit.inliers.projected import ImageInliers
 from sfm_audit.audit.misfit import candidate_fields, coincident_keypoints, nuisance_columns, prepare
 from sfm_audit.audit.misfit.untestable import untestable_tests
@@ -25,13 +26,13 @@ def qualities_of_joined(
     """
     camera, num_images = shape.camera, len(sigma_px)
     projected = joined.projected
-    nuisance = _by_image(nuisance_columns(camera.model, projected), num_images)
-    fields = _by_image(candidate_fields(camera, projected), num_images)
+    nuisance = by_image(nuisance_columns(camera.model, projected), num_images)
+    fields = by_image(candidate_fields(camera, projected), num_images)
     xy_px = joined.xy_px.reshape(num_images, -1, 2)
     residuals = joined.residuals_px.reshape(2, num_images, -1)
-    known = parameter_covariances(_flat(nuisance), fitted_names(camera.model), sigma_px)
+    known = parameter_covariances(flat(nuisance), fitted_names(camera.model), sigma_px)
     depth = np.median(depths(camera, joined.xyz_cam).reshape(num_images, -1), axis=1).tolist()
-    tests = untestable_tests(_flat(nuisance), _flat(fields), _num_pixels(xy_px))
+    tests = untestable_tests(flat(nuisance), flat(fields), _num_pixels(xy_px))
     out = []
     for b, sigma in enumerate(sigma_px.tolist()):
         misfit = tests[b]
@@ -41,18 +42,6 @@ def qualities_of_joined(
         own = identifiability_of(camera, known[b])
         out.append(quality_from(shape, misfit, own, depth[b], xy_px[b], sigma_px=sigma, grid=grid))
     return out
-
-
-def _by_image(columns: FloatArray, num_images: int) -> FloatArray:
-    """(B, c, 2, n) of (c, 2, B n)."""
-    num_points = columns.shape[2] // num_images  # of no columns too
-    by_column = columns.reshape(len(columns), 2, num_images, num_points)
-    return np.ascontiguousarray(by_column.transpose(2, 0, 1, 3))
-
-
-def _flat(columns: FloatArray) -> FloatArray:
-    """(B, c, 2 n) of (B, c, 2, n)."""
-    return columns.reshape(*columns.shape[:2], 2 * columns.shape[3])
 
 
 def _num_pixels(xy_px: FloatArray) -> IntArray:

@@ -14,7 +14,7 @@ from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
-from sfm_audit.audit.inliers.joined import joined_inliers
+from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit import (
@@ -37,8 +37,6 @@ from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel
 
-_MAX_JOINED: Final = 64
-"""Images with more inliers are made one by one."""
 _MAX_WINDOW: Final = 128
 
 
@@ -96,13 +94,13 @@ class _CameraImages:
             found: dict[int, Piece] = {}
             for num_points in {len(tracks[k]) for k in ahead}:
                 alike = [k for k in ahead if len(tracks[k]) == num_points]
-                if 0 < num_points <= _MAX_JOINED and len(alike) > 1:
+                if 0 < num_points <= MAX_JOINED and len(alike) > 1:
                     found.update(zip(alike, together(alike), strict=True))
             return [found[k] if k in found else piece_of(design(k)) for k in ahead]
 
         longest = max(map(len, tracks), default=0)
         if longest <= AT_ONCE:
-            num_images, size = len(self.image_idxs), _MAX_WINDOW if longest <= _MAX_JOINED else 1
+            num_images, size = len(self.image_idxs), _MAX_WINDOW if longest <= MAX_JOINED else 1
             return camera_tests_of_pieces(in_windows(some, num_images, size), num_images, num_tracks, exact=False)
         parted = [PartedImage(track, partial(pose, k), partial(design, k)) for k, track in enumerate(tracks)]
         return camera_tests_in_parts(parted, num_tracks)

@@ -13,15 +13,13 @@ from sfm_audit.audit.camera_quality.measure import (
     camera_quality,
     camera_quality_in_parts,
 )
-from sfm_audit.audit.inliers.joined import joined_inliers
+from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import SparseModel
 
-_MAX_JOINED: Final = 64
-"""Of an image with more inliers the values cost more than the calls, and few have the same number."""
 _MAX_POINTS_AT_ONCE: Final = 4096
 
 
@@ -54,7 +52,7 @@ def quality_of_images(
         if shape is None:
             continue
         num_inliers = rows.stop - rows.start
-        if num_inliers <= _MAX_JOINED:
+        if num_inliers <= MAX_JOINED:
             alike.setdefault((camera_idx, num_inliers), []).append(place)
         else:
             out[place] = _quality_of(shape, model, residuals, image_idx, float(sigma_px[image_idx]), grid=grid)

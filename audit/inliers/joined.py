@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from sfm_audit.audit.inliers.projected import ImageInliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel, moved, rotation_from_quat
+
+MAX_JOINED: Final = 64
+"""Of an image with more inliers the values cost more than the calls, and few have the same number."""
 
 
 def joined_inliers(
@@ -44,3 +48,15 @@ def _in_camera(quats: FloatArray, point_jacobian: FloatArray) -> FloatArray:
     cam_from_gradient = np.linalg.pinv(rotation_from_quat(quats).swapaxes(1, 2))[:, None]
     by_image = point_jacobian.reshape(2, 3, len(quats), -1).transpose(2, 0, 1, 3)
     return np.ascontiguousarray((cam_from_gradient @ by_image).transpose(1, 2, 0, 3)).reshape(point_jacobian.shape)
+
+
+def by_image(columns: FloatArray, num_images: int) -> FloatArray:
+    """Return (B, c, 2, n) of columns (c, 2, B n) of joined inliers."""
+    num_points = columns.shape[2] // num_images  # of no columns too
+    by_column = columns.reshape(len(columns), 2, num_images, num_points)
+    return np.ascontiguousarray(by_column.transpose(2, 0, 1, 3))
+
+
+def flat(columns: FloatArray) -> FloatArray:
+    """Return (B, c, 2 n) of (B, c, 2, n)."""
+    return columns.reshape(*columns.shape[:2], 2 * columns.shape[3])

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.linalg.blas import dgemm
 
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NUISANCE_THRESHOLD: Final = 1e-9  # of the largest singular value (method.md section 5, step 1)
 FIELD_THRESHOLD: Final = 1e-6  # of the largest singular value before projection
@@ -76,6 +76,32 @@ def nuisance_basis(columns: FloatArray, *, exact: bool = False) -> FloatArray:
             return np.asarray((vectors / np.sqrt(values)).T @ basis, dtype=np.float64)
     largest = np.linalg.svd(np.linalg.qr(columns.T, mode="r"), compute_uv=False)[0]
     return exact_basis(columns, NUISANCE_THRESHOLD * largest)
+
+
+def nuisance_bases(columns: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the images whose columns have full rank beyond doubt, and the `nuisance_basis` of these, (.., q, m).
+
+    Parameters
+    ----------
+    columns : (B, q, m) of each image, of any length
+    """
+    squares = np.einsum("bcm,bcm->bc", columns, columns)
+    usual = np.flatnonzero(in_range(squares))
+    unit = columns[usual] / np.sqrt(squares[usual])[:, :, None]
+    values, vectors = np.linalg.eigh(unit @ unit.swapaxes(1, 2))
+    sure = values[:, 0] > SMALLEST_PIVOT * values[:, -1]
+    q = _orthonormal(vectors[sure], values[sure], unit[sure])
+    values, vectors = np.linalg.eigh(q @ q.swapaxes(1, 2))  # again: orthonormal to rounding
+    return usual[sure].astype(np.int64), _orthonormal(vectors, values, q)
+
+
+def in_range(squares: FloatArray, smallest: float = SAFE_SQUARE) -> BoolArray:
+    """(B,) whether all of (B, c) sums of squares are in the range in which nothing is lost."""
+    return np.asarray(((squares > smallest) & (squares < 1.0 / smallest)).all(axis=1))
+
+
+def _orthonormal(vectors: FloatArray, values: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray((vectors / np.sqrt(values)[:, None]).swapaxes(1, 2) @ columns)
 
 
 def project_off(basis: FloatArray, columns: FloatArray) -> FloatArray:

@@ -33,9 +33,9 @@ def untestable_tests(nuisance: FloatArray, fields: FloatArray, num_clusters: Int
     if not fields.shape[1] or nuisance.shape[2] > 2 * MAX_POINTS:
         return out
     with np.errstate(over="ignore", invalid="ignore"):  # beyond range is not usual
-        chosen, q = _nuisance_bases(nuisance)
+        chosen, q = basis.nuisance_bases(nuisance)
         sq_lengths = np.einsum("bcm,bcm->bc", fields, fields)
-    usual = ((sq_lengths > basis.MODEST_SQUARE) & (sq_lengths < 1.0 / basis.MODEST_SQUARE)).all(axis=1)[chosen]
+    usual = basis.in_range(sq_lengths, basis.MODEST_SQUARE)[chosen]
     chosen, q = chosen[usual], q[usual]
     ranks = _ranks_of_groups(q, fields[chosen], sq_lengths[chosen])
     known: dict[tuple[tuple[int | None, ...], int], MisfitTests | None] = {}
@@ -46,22 +46,6 @@ def untestable_tests(nuisance: FloatArray, fields: FloatArray, num_clusters: Int
         refused = known[key]
         out[b] = None if refused is None else dict(refused)
     return out
-
-
-def _nuisance_bases(nuisance: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Images whose nuisance has full rank beyond doubt, and of these its orthonormal basis (.., q, m)."""
-    squares = np.einsum("bcm,bcm->bc", nuisance, nuisance)
-    usual = np.flatnonzero(((squares > basis.SAFE_SQUARE) & (squares < 1.0 / basis.SAFE_SQUARE)).all(axis=1))
-    unit = nuisance[usual] / np.sqrt(squares[usual])[:, :, None]
-    values, vectors = np.linalg.eigh(unit @ unit.swapaxes(1, 2))
-    sure = values[:, 0] > basis.SMALLEST_PIVOT * values[:, -1]
-    q = _times(vectors[sure], values[sure], unit[sure])
-    values, vectors = np.linalg.eigh(q @ q.swapaxes(1, 2))  # again: orthonormal to rounding
-    return usual[sure].astype(np.int64), _times(vectors, values, q)
-
-
-def _times(vectors: FloatArray, values: FloatArray, columns: FloatArray) -> FloatArray:
-    return np.asarray((vectors / np.sqrt(values)[:, None]).swapaxes(1, 2) @ columns)
 
 
 def _ranks_of_groups(q: FloatArray, fields: FloatArray, sq_lengths: FloatArray) -> list[tuple[int | None, ...]]:
