@@ -46,7 +46,7 @@ def test_defaults_then_file_then_command_line(tmp_path):
         ('noise = "loud"', "noise: expected 'track', 'constant' or 'keypoint', found 'loud'"),
         ('points = "both"', "points: expected 'in-sample' or 'independent', found 'both'"),
         ('min_effect = "0.2"', "min_effect: expected a number with its unit, such as 0.2px or 0.5sigma, found '0.2'"),
-        ("min_effect = 0.2", "min_effect: expected a valid string, found 0.2"),
+        ("min_effect = 0.2", "min_effect: expected a number with its unit, such as 0.2px or 0.5sigma, found 0.2"),
         ('points = "independent"', "points = independent takes noise = constant, not track"),
         ("[audit]\nalpha = 0.1", "unknown setting audit"),
         ("alpha = ", "not a TOML file"),
