@@ -117,7 +117,7 @@ class ScopeNumbers:
 
     sigma_px: median of sigma_constant_px.    noise_s0_px, recomputed_error_px: medians of the models' numbers.
     rejected_by_reason: of the rejected images.    by_reason: of all, whatever the verdict.
-    accepted: the images that were accepted.
+    accepted: the images that were accepted. Neither counts as a difference: other fields show what changed.
     """
 
     num_images: int
@@ -128,8 +128,8 @@ class ScopeNumbers:
     sigma_px: float | None
     noise_s0_px: float | None
     recomputed_error_px: float | None
-    accepted: tuple[ImageState, ...] = ()
-    by_reason: Mapping[str, int] = field(default_factory=dict)
+    accepted: tuple[ImageState, ...] = field(default=(), compare=False)
+    by_reason: Mapping[str, int] = field(default_factory=dict, compare=False)
 
     def share(self, count: int) -> float | None:
         """Return a count as a share of the images, None without images."""

@@ -60,7 +60,7 @@ def test_one_and_two_processes_give_the_same_page():
     assert pages == document(two, all_checks(two), 1)
     text = "".join(pages.values())
     assert "nan" not in text
-    assert text.count("\n## ") == 14
+    assert text.count("\n## ") == 15
 
 
 def test_single_images_are_fitted():

@@ -44,11 +44,17 @@ def model(tmp_path):
     return open_model(write_binary(tmp_path / "sparse" / "0", Model((Camera(),), images, (Point(7, tracks),))))
 
 
+def pycolmap_s_earth():
+    """GPSTransform of WGS84; 4.1 misspells the name of the ellipsoids."""
+    ellipsoids = getattr(pycolmap, "GPSTransformEllipsoid", None) or pycolmap.GPSTransfromEllipsoid
+    return pycolmap.GPSTransform(ellipsoids.WGS84)
+
+
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (90.0, 0.0, 10.0), (-33.9, 151.2, 58.0), (47.0, -179.9, 8848.0)])
 def test_the_earth_is_pycolmap_s(place):
     """pycolmap 4.2.1, GPSTransform of WGS84 (its default ellipsoid is GRS80, 0.1 mm away)."""
     near = np.array(place) + np.random.default_rng(1).normal(0, 0.01, (20, 3)) * [1, 1, 1000]
-    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    earth = pycolmap_s_earth()
     assert_allclose(ecef_of(near), earth.ellipsoid_to_ecef(near), rtol=1e-13, atol=1e-6)
     assert_allclose(enu_of(near, np.array(place)), earth.ellipsoid_to_enu(near, *place), atol=1e-6)
 
@@ -59,7 +65,7 @@ def test_priors_of_a_database_are_metres_about_their_middle(tmp_path, model):
     assert not Path(found.location).is_absolute()
     order = [NAMES.index(name) for name in model.images.name if name in NAMES]
     known = [i for i, name in enumerate(model.images.name) if name in NAMES]
-    wanted = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84).ellipsoid_to_enu(PLACES, *PLACES[order[1]])
+    wanted = pycolmap_s_earth().ellipsoid_to_enu(PLACES, *PLACES[order[1]])
     assert_allclose(found.position[known], wanted[order], atol=1e-6)
     assert_allclose(found.covariance[known], np.tile(COVARIANCE, (3, 1, 1)))
     assert np.isnan(found.position[model.image_idx("stranger.jpg")]).all()
