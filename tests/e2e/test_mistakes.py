@@ -100,7 +100,7 @@ WRONG_WORD = [
     ("check RUN --policy-file text.toml", 2, "limits.max_share_rejected: expected a valid number, found '10%'"),
     ("check RUN --policy-file section.toml", 2, "unknown key limit, did you mean limits?"),
     ("check RUN --policy limits.toml", 2, "'limits.toml' is not one of"),
-    ("filter RUN -o kept.txt", 2, "No such option '-o'"),
+    ("filter RUN -o kept.txt", 2, "No such option"),
 ]
 MISSING_OR_CONTRADICTING = [
     ("run", 2, "Missing argument 'PATH...'"),
