@@ -85,6 +85,27 @@ def name_of_database(path: Path, model_location: str, below: str) -> str:
     return posixpath.normpath(posixpath.join(below, Path(os.path.relpath(path, model_location)).as_posix()))
 
 
+def database_of(model_location: str, shown_as: str, below: str, option: str) -> tuple[Path, str]:
+    """Return the database that belongs to a model, and how findings call it.
+
+    Parameters
+    ----------
+    shown_as : how errors call the model    below : see `name_of_database`    option : that would name another one
+
+    Raises
+    ------
+    MissingFileError
+        There is none.
+    UnreadableFileError
+        See `find_database`.
+    """
+    path = find_database(model_location)
+    if path is None:
+        wanted = "a database.db beside the model or up to three folders above it"
+        raise MissingFileError(shown_as, None, wanted, "none", f"name it with {option}")
+    return path, name_of_database(path, model_location, below)
+
+
 def read_keypoint_shapes(path: str | Path, model: SparseModel) -> KeypointShapes:
     """Read the keypoint scales of a model's observations from the database it was made from.
 

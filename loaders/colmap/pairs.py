@@ -21,14 +21,13 @@ from sfm_audit.loaders.colmap.database import (
     StoredRows,
     asked,
     check_database,
-    find_database,
+    database_of,
     malformed,
-    name_of_database,
     rows_by_name,
     stored_keypoints,
 )
 from sfm_audit.loaders.colmap.sqlite_guard import PAIR_TABLES, open_database
-from sfm_audit.loaders.errors import LoadError, MissingFileError, called
+from sfm_audit.loaders.errors import LoadError, called
 from sfm_audit.loaders.model import MatchedPair, PairSource, SparseModel
 
 AUTO: Final = "auto"
@@ -194,11 +193,7 @@ def database_pairs(model: SparseModel, database: str, shown_as: str, below: str 
     if database != AUTO:
         return DatabasePairs(database, model)
     try:
-        path = find_database(model.location)
-        if path is None:
-            wanted = "a database.db beside the model or up to three folders above it"
-            raise MissingFileError(shown_as, None, wanted, "none", "name it with --database")
-        name = name_of_database(path, model.location, below)
+        path, name = database_of(model.location, shown_as, below, "--database")
         with called(name):
             return _PairsOfModel(DatabasePairs(path, model), name)
     except LoadError as error:

@@ -9,15 +9,16 @@ with # are comments.
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
-from sfm_audit.loaders.colmap.database import find_database, name_of_database
+from sfm_audit.loaders.colmap.database import database_of
 from sfm_audit.loaders.colmap.priors import CARTESIAN, NOT_SAID, WGS84, StoredPriors, read_stored_priors
-from sfm_audit.loaders.errors import LoadError, MalformedFileError, MissingFileError, called
+from sfm_audit.loaders.errors import LoadError, MalformedFileError, called
 from sfm_audit.loaders.evidence import NotAsked, PositionPriors
 from sfm_audit.loaders.model import SparseModel
 from sfm_audit.loaders.paths.files import open_input, reading
@@ -62,11 +63,7 @@ def priors_of(model: SparseModel, priors: str, shown_as: str, below: str = "") -
     if priors != AUTO:
         return _of_images(model, parse_location(priors))
     try:
-        path = find_database(model.location)
-        if path is None:
-            wanted = "a database.db beside the model or up to three folders above it"
-            raise MissingFileError(shown_as, None, wanted, "none", "name it with --priors")
-        name = name_of_database(path, model.location, below)
+        path, name = database_of(model.location, shown_as, below, "--priors")
         with called(name):
             return _of_images(model, path, name)
     except LoadError as error:
@@ -161,14 +158,16 @@ def _read_csv(path: InputPath) -> tuple[StoredPriors, bool]:
     if len(set(kept)) != len(kept):
         raise file.malformed(lines[0][0], "each name once", f"{len(kept) - len(set(kept))} again")
     system = WGS84 if axes == _GEODETIC else NOT_SAID
-    in_metres = any(b"unit=m" in line.split() or b"unit=m" in line[1:].split() for line in _comments(file))
+    in_metres = any(b"unit=m" in comment for comment in _comments(file))
     values = values[known]
     stored = StoredPriors(kept, values[:, :3], _covariance(values[:, 3:]), system)
     return stored, system == WGS84 or in_metres
 
 
-def _comments(file: TextFile) -> list[bytes]:
-    return [line.strip() for line in file.lines if line.lstrip().startswith(b"#")]
+def _comments(file: TextFile) -> list[list[bytes]]:
+    """Return the words of each comment; blanks around = do not count."""
+    lines = (line.strip() for line in file.lines)
+    return [re.split(rb"[#\s,;]+", re.sub(rb"\s*=\s*", b"=", line)) for line in lines if line.startswith(b"#")]
 
 
 def _covariance(values: FloatArray) -> FloatArray:

@@ -162,6 +162,14 @@ def csv(folder, text):
     return path
 
 
+@pytest.mark.parametrize(
+    ("comment", "in_metres"),
+    [("# unit = m", True), ("#unit= m, ENU", True), ("# ENU unit =m", True), ("# unit=mm", False)],
+)
+def test_a_comment_says_that_a_csv_is_in_metres(tmp_path, comment, in_metres):
+    assert read_priors(csv(tmp_path, f"{comment}\nname,x,y,z\na,1,2,3\nb,4,5,6\n"))[1] is in_metres
+
+
 def test_columns_of_a_csv(tmp_path):
     stored, is_metric = read_priors(csv(tmp_path, "# unit=m\nname,x,y,z,sd\na,1,2,3,2\nb,4,5,6,3\nc,,,,\n"))
     assert stored.names == ("a", "b")
