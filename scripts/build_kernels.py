@@ -2,7 +2,9 @@
 
     scripts/build_kernels.py [--if-stale]
 
-Where there is no C compiler nothing is built and everything works with numpy alone.
+Where there is no C compiler nothing is built and everything works with numpy alone: exit code 69 then, and 1 where the
+compiler fails. CC chooses the compiler, arguments included; otherwise cc, gcc or clang. CFLAGS and LDFLAGS are not
+heeded: what orders sums and fuses products must not be changed by them.
 """
 
 from __future__ import annotations
@@ -10,9 +12,13 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
+import platform
+import re
+import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,8 +26,15 @@ SOURCES = ROOT / "sfm_audit" / "audit" / "kernels" / "source"
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = SOURCES.parent / f"compiled{SUFFIX}"
 # Fixed summation order: nothing that lets a compiler reorder or fuse. The rest does not change what is computed.
-FLAGS = ["-std=gnu99", "-O3", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
+FLAGS = ["-std=gnu99", "-O3", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
 WARNINGS = ["-Wall", "-Wextra", "-Werror=implicit-function-declaration"]
+COMPILERS = ("cc", "gcc", "clang")
+NO_COMPILER = f"no C compiler ({', '.join(COMPILERS)}, or CC)"
+LIMIT_SECONDS = 600
+EXIT_UNAVAILABLE = 69
+OLDEST_MACOS = "11.0"  # the first for both kinds of processors
+OLDEST_GLIBC = (2, 17)  # manylinux tags below are known to nobody who has a Python that we support
+ALLOWED_LIBRARIES = {"libc.so.6", "libm.so.6"}  # every system of a manylinux tag has them
 
 
 def sources_hash() -> str:
@@ -33,56 +46,91 @@ def sources_hash() -> str:
 
 
 def compiler() -> list[str] | None:
-    """The C compiler: CC, then the usual names."""
-    named = os.environ.get("CC", "").split()
-    for command in [named] if named else [["cc"], ["gcc"], ["clang"]]:
+    """The C compiler with its arguments: CC, otherwise the first of the usual names that is there."""
+    try:
+        named = shlex.split(os.environ.get("CC", ""), posix=os.name != "nt")
+    except ValueError:  # an open quote
+        return None
+    for command in [named] if named else [[name] for name in COMPILERS]:
         if shutil.which(command[0]):
             return command
     return None
+
+
+def platform_flags() -> list[str]:
+    """What the operating system needs: macOS to know for which of its versions, the others position independence."""
+    if sys.platform == "darwin":
+        return ["-fPIC", "-arch", platform.machine(), f"-mmacosx-version-min={OLDEST_MACOS}"]
+    return ["-static-libgcc"] if sys.platform == "win32" else ["-fPIC", "-s"]
 
 
 def build(library: Path = LIBRARY, extra: list[str] | None = None) -> str | None:
     """Compile; None when it worked, else why there is no library."""
     command = compiler()
     if command is None:
-        return "no C compiler (CC, cc, gcc, clang)"
+        return NO_COMPILER
     partial = library.with_suffix(f".{os.getpid()}.partial")
     sources = [str(path) for path in sorted(SOURCES.glob("*.c"))]
-    hashed = [f'-DSFM_SOURCES="{sources_hash()}"']
-    done = subprocess.run(
-        [*command, *FLAGS, *WARNINGS, *(extra or []), *hashed, "-o", str(partial), *sources, "-lm"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
+    flags = [*FLAGS, *platform_flags(), *WARNINGS, *(extra or []), f'-DSFM_SOURCES="{sources_hash()}"']
+    try:
+        done = subprocess.run(
+            [*command, *flags, "-o", str(partial), *sources, "-lm"],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+            stdin=subprocess.DEVNULL,
+            timeout=LIMIT_SECONDS,
+        )
+        if done.returncode:
+            return f"{shlex.join(command)} failed: {done.stderr.strip() or f'exit code {done.returncode}'}"
+        if done.stderr:
+            print(done.stderr, file=sys.stderr)
+        partial.replace(library)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{shlex.join(command)} cannot be used: {error}"
+    finally:
         partial.unlink(missing_ok=True)
-        return f"{' '.join(command)} failed:\n{done.stderr}"
-    if done.stderr:
-        print(done.stderr, file=sys.stderr)
-    partial.replace(library)
     return None
 
 
-def is_stale() -> bool:
-    """Whether the library is missing or older than a source."""
-    if not LIBRARY.exists():
-        return True
-    built = LIBRARY.stat().st_mtime
-    return any(path.stat().st_mtime > built for path in SOURCES.glob("*.[ch]"))
+def is_stale(library: Path = LIBRARY) -> bool:
+    """Whether the library is missing or carries the hash of other sources."""
+    return not library.exists() or sources_hash().encode() not in library.read_bytes()
+
+
+def platform_tag(library: Path) -> str:
+    """Return the tag of a wheel that holds this library: the systems on which it can be loaded.
+
+    With glibc its oldest version that has all symbols that the library asks for (manylinux_2_x), read from the names in
+    the library itself; names that stand there for another reason make the tag stricter, never wrong.
+    """
+    if sys.platform == "darwin":
+        return f"macosx_{OLDEST_MACOS.replace('.', '_')}_{platform.machine()}"
+    tag = re.sub(r"[-.]", "_", sysconfig.get_platform())
+    content = library.read_bytes()
+    needed = {name.decode() for name in re.findall(rb"lib[\w.+-]+\.so(?:\.\d+)*", content)}
+    versions = {name.decode() for name in re.findall(rb"GLIBC_(\w+(?:\.\w+)*)", content)}
+    numbered = {tuple(map(int, version.split("."))) for version in versions if re.fullmatch(r"2(\.\d+)+", version)}
+    has_glibc = tag.startswith("linux_") and platform.libc_ver()[0] == "glibc"
+    if not has_glibc or needed - ALLOWED_LIBRARIES or len(numbered) < len(versions):
+        return tag  # musl, another library, or a feature of glibc that has no number
+    major, minor = max([OLDEST_GLIBC, *(version[:2] for version in numbered)])
+    return f"many{tag.replace('linux_', f'linux_{major}_{minor}_', 1)}"
 
 
 def main() -> int:
     """Build, or say why not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--if-stale", action="store_true", help="only where the library is older than its sources")
+    parser.add_argument("--if-stale", action="store_true", help="only where the library is of other sources")
     args = parser.parse_args()
     if args.if_stale and not is_stale():
+        LIBRARY.touch()  # who looks at times of change alone need not ask again
         return 0
     problem = build()
     if problem is not None:
         print(f"build_kernels: {problem}", file=sys.stderr)
-        return 1
+        return EXIT_UNAVAILABLE if problem == NO_COMPILER else 1
     return 0
 
 

@@ -1,5 +1,6 @@
-"""Make a release ready: check, build the wheel and the sdist into dist/, print the commands that tag it.
+"""Make a release ready: check, build the wheels and the sdist into dist/, print the commands that tag it.
 
+Two wheels: one with compiled kernels for this platform, for which a C compiler is needed here, and one for any other.
 Nothing is tagged, pushed or uploaded. With --dry-run nothing is written either, and the changes may still stand under
 "Unreleased". All that is wrong is said at once.
 """
@@ -7,6 +8,7 @@ Nothing is tagged, pushed or uploaded. With --dry-run nothing is written either,
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -66,8 +68,11 @@ def tree_faults(tag: str) -> list[str]:
 
 
 def build(out: Path) -> list[Path]:
-    """Build the wheel and the sdist, and check what they hold; raises CalledProcessError."""
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "--directory", str(out)], cwd=ROOT, check=True)
+    """Build a wheel with compiled kernels, one without, and the sdist; check what they hold; CalledProcessError."""
+    hatchling = [sys.executable, "-m", "hatchling", "build", "--directory", str(out)]
+    for target, kernels in (("wheel", "1"), ("wheel", "0"), ("sdist", "0")):
+        env = {**os.environ, "SFM_AUDIT_KERNELS": kernels}
+        subprocess.run([*hatchling, "--target", target], cwd=ROOT, env=env, check=True)
     built = sorted(path for path in out.iterdir() if path.name.endswith((".whl", ".tar.gz")))
     subprocess.run([sys.executable, str(ROOT / "scripts" / "check_wheel.py"), *map(str, built)], check=True)
     return built
@@ -94,9 +99,13 @@ def main() -> int:
         return 1
     with tempfile.TemporaryDirectory() as folder:
         built = build(Path(folder) if dry else out)
+    foreign = [path.name for path in built if "-linux_" in path.name]
+    if foreign:
+        print(f"release: {foreign[0]} has no manylinux tag, so no index takes it: build with glibc", file=sys.stderr)
+        return 1
     print(f"\nsfm-audit {version} of {git('rev-parse', '--short', 'HEAD')}{' (dry run)' if dry else ''}. What remains:")
     print(f"  git tag -a {tag} -m 'sfm-audit {version}' && git push origin {tag}")
-    print(f"  publish {' and '.join(path.name for path in built)} from dist/ where packages are published")
+    print(f"  publish {', '.join(path.name for path in built)} from dist/ where packages are published")
     return 0
 
 

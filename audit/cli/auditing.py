@@ -20,6 +20,7 @@ from sfm_audit.audit.cli.journal import note
 from sfm_audit.audit.cli.progress import Progress
 from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.kernels import KernelError, kernels_in_use, path_taken
 from sfm_audit.audit.schedule.errors import ClusterError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
 from sfm_audit.audit.schedule.runner import audit_many
@@ -64,6 +65,7 @@ def run_audit(request: RunRequest, found: Discovery) -> ExitCode:
     if request.dask is not None and importlib.util.find_spec("distributed") is None:
         raise KnownError("--dask needs the extra cluster: pip install 'sfm-audit[cluster]'", ExitCode.USAGE)
     start = time.perf_counter()
+    _say_path(request)
     num_bytes = sum(ref.num_bytes for ref in found.refs)
     note(f"run {' '.join(request.paths)} -o {request.folder}: {len(found.refs)} models, {num_bytes / 1e6:.1f} MB")
     problems = [RunFailure(error.path, str(error)) for error in found.errors]
@@ -75,6 +77,19 @@ def run_audit(request: RunRequest, found: Discovery) -> ExitCode:
         except OutputError as error:
             raise KnownError(str(error), max(ExitCode.OUTPUT, _say(problems, request.folder))) from error
     return _say(problems, request.folder)
+
+
+def _say_path(request: RunRequest) -> None:
+    """Say once, to whoever watches, whether numbers come from compiled kernels or from numpy alone."""
+    try:
+        compiled = kernels_in_use()
+    except KernelError as error:
+        raise KnownError(str(error), ExitCode.USAGE) from error
+    name, reason, _ = path_taken()
+    said = f"computing with compiled kernels ({reason})" if compiled else f"computing with {name} alone: {reason}"
+    note(said)
+    if not request.quiet and sys.stderr.isatty():
+        click.echo(f"sfm-audit: {said}", err=True)
 
 
 def _say(problems: Sequence[RunFailure], folder: Path) -> ExitCode:
@@ -110,6 +125,7 @@ def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure]
         list(request.paths),
         _paths_without_models(request.paths, found),
         request.observations,
+        path_taken()._asdict(),
     )
     silent = request.quiet or not sys.stderr.isatty()
     store = RunStore(request.folder, settings)

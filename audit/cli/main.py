@@ -76,8 +76,25 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(VERBS.items()))
 
 
+def _say_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
+    if not asked or context.resilient_parsing:
+        return
+    from sfm_audit.audit.kernels import path_taken  # noqa: PLC0415 - imports numpy
+
+    path = path_taken()
+    click.echo(f"sfm-audit {importlib.metadata.version('sfm-audit')}\nnumbers by {path} ({path.reason})")
+    context.exit()
+
+
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(package_name="sfm-audit", prog_name="sfm-audit", message="%(prog)s %(version)s")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_say_version,
+    help="Say the version, and whether numbers come from compiled kernels.",
+)
 def cli() -> None:
     """Say which images of a structure-from-motion reconstruction to trust, and why not the others."""
 

@@ -29,16 +29,21 @@ Double: Final = ctypes.c_double
 
 
 class Path(NamedTuple):
-    """Which path numbers take: "compiled" or "numpy", and why."""
+    """Which path numbers take: "compiled" or "numpy", and why.    sources: hash of the C sources of the first."""
 
     name: str
     reason: str
+    sources: str | None = None
+
+    def __str__(self) -> str:
+        return self.name if self.sources is None else f"{self.name} {self.sources[:_SHOWN_HASH]}"
 
 
 class KernelError(RuntimeError):
     """The compiled path was insisted on and is not there."""
 
 
+_SHOWN_HASH: Final = 12
 _forced_off = False
 
 
@@ -63,7 +68,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str]:
         return None, f"{LIBRARY.name} cannot be loaded: {error}"
     if built_from != sources_hash():
         return None, f"{LIBRARY.name} is of other sources: run scripts/build_kernels.py"
-    return found, f"{LIBRARY.name} of sources {built_from[:12]}"
+    return found, f"{LIBRARY.name} of sources {built_from[:_SHOWN_HASH]}"
 
 
 def library() -> ctypes.CDLL | None:
@@ -104,7 +109,7 @@ def path_taken() -> Path:
     if _forced_off or os.environ.get(VARIABLE, "") == "0":
         return Path("numpy", f"{VARIABLE}=0" if not _forced_off else "asked for")
     found, reason = _loaded()
-    return Path("numpy" if found is None else "compiled", reason)
+    return Path("numpy", reason) if found is None else Path("compiled", reason, sources_hash())
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from typing import IO, Any, Final, TypeVar
 import numpy as np
 
 from sfm_audit.audit.engine.model import ModelAuditor, Spread, in_turn
+from sfm_audit.audit.kernels import path_taken
 from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
 
 _ALIGNMENT: Final = 64
@@ -37,8 +38,11 @@ _serial = itertools.count()
 
 
 @contextmanager
-def image_processes(num_processes: int) -> Iterator[Spread]:
-    """Yield a way to run a function over the images of a model: in turn, or in that many processes."""
+def image_processes(num_processes: int, paths: set[str]) -> Iterator[Spread]:
+    """Yield a way to run a function over the images of a model: in turn, or in that many processes.
+
+    paths: to which those processes add the path that their numbers take, compiled kernels or numpy.
+    """
     if num_processes <= 1 or not _OPEN_FILES.exists():
         yield in_turn
         return
@@ -52,12 +56,14 @@ def image_processes(num_processes: int) -> Iterator[Spread]:
                 except OSError:  # no room for it: this process has all it needs
                     return in_turn(function, auditor)
                 place = f"/proc/{os.getpid()}/fd/{file.fileno()}", next(_serial)
-                return _gather(lanes, num_processes, len(auditor.model.images), (place, function))
+                return _gather(lanes, num_processes, len(auditor.model.images), (place, function), paths)
 
         yield spread
 
 
-def _gather(lanes: Lanes[int], num_processes: int, num_images: int, call: tuple[Any, ...]) -> list[Any]:
+def _gather(
+    lanes: Lanes[int], num_processes: int, num_images: int, call: tuple[Any, ...], paths: set[str]
+) -> list[Any]:
     """Answers of all images in their order; raises ProcessDiedError when a process dies."""
     size = max(1, math.ceil(num_images / (num_processes * _PARTS_PER_PROCESS)))
     answers: dict[int, list[Any]] = {}
@@ -68,13 +74,16 @@ def _gather(lanes: Lanes[int], num_processes: int, num_images: int, call: tuple[
         for start, answer in lanes.wait():
             if isinstance(answer, Died):
                 raise ProcessDiedError(str(answer))
-            answers[start] = answer
+            path, answers[start] = answer
+            paths.add(path)
     return [item for start in sorted(answers) for item in answers[start]]
 
 
-def _run_part(place: tuple[str, int], function: Callable[[Any, range], list[T]], start: int, stop: int) -> list[T]:
+def _run_part(
+    place: tuple[str, int], function: Callable[[Any, range], list[T]], start: int, stop: int
+) -> tuple[str, list[T]]:
     with np.errstate(all="ignore"):  # as `audit_model` does
-        return function(_opened(*place), range(start, stop))
+        return str(path_taken()), function(_opened(*place), range(start, stop))
 
 
 @lru_cache(maxsize=1)

@@ -53,8 +53,15 @@ class Sink(Protocol):
     def finished(self, ref: ModelRef) -> InputState | None:
         """Return the input a model was finished with under this config, or None."""
 
-    def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
-        """Take the tables of one model, in place of what was there."""
+    def write(
+        self,
+        ref: ModelRef,
+        state: InputState,
+        tables: Mapping[str, pa.Table],
+        seconds: float,
+        computed_by: str = "",
+    ) -> None:
+        """Take the tables of one model, in place of what was there; see `Audited`."""
 
     def drop(self, key: str) -> None:
         """Forget a model."""
@@ -145,7 +152,7 @@ def _hand_over(
                 sink.keep_report(task.ref, outcome.report)
             on_failure(outcome)
         elif isinstance(outcome, Audited):
-            sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds)
+            sink.write(task.ref, outcome.state, outcome.tables, outcome.seconds, outcome.computed_by)
         on_done(task.ref)
     return failures
 

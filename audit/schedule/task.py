@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import audit_model
+from sfm_audit.audit.kernels import path_taken
 from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders import LoadError, ModelRef, open_model
@@ -85,11 +86,15 @@ class Task:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Audited:
-    """The tables of one model (by name), the input they were made from, and how long it took."""
+    """The tables of one model (by name), the input they were made from, and how long it took.
+
+    computed_by: which path numbers took, compiled kernels and of which sources, or numpy; several with + between them.
+    """
 
     state: InputState
     tables: Mapping[str, pa.Table]
     seconds: float
+    computed_by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +110,8 @@ def audit_one(task: Task) -> Outcome:
     """Load and audit one model; a model that cannot be read is a Failure, any other error is raised (see `guarded`)."""
     start = time.perf_counter()
     ref = task.ref
-    with image_processes(task.num_processes) as spread:  # they start while the model is read
+    paths = {str(path_taken())}
+    with image_processes(task.num_processes, paths) as spread:  # they start while the model is read
         try:
             state = replace(read_input_state(ref.location), evidence=evidence_of(ref, task.config))
             if state.digest == task.known_digest:
@@ -121,7 +127,7 @@ def audit_one(task: Task) -> Outcome:
         audited = audit_model(
             model, task.config, labels, scale_px, observations=task.observations, spread=spread, given=given
         )
-    return Audited(state, audited.tables, time.perf_counter() - start)
+    return Audited(state, audited.tables, time.perf_counter() - start, "+".join(sorted(paths)))
 
 
 def _given(task: Task, model: SparseModel) -> Given:

@@ -27,6 +27,7 @@ _Key = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 _Table = Annotated[str, Field(pattern=r"^(images|cameras|models|observations)$")]
 _Count = Annotated[int, Field(ge=0, le=2**62)]
 _Text = Annotated[str, Field(max_length=100_000)]
+_Path = Annotated[str, Field(max_length=200)]
 _Setting = str | bool | int | float | None
 
 
@@ -50,6 +51,18 @@ class FailureRecord(_Record):
     message: _Text
     kind: str = Field(default="unreadable", max_length=40)
     report: str | None = Field(default=None, max_length=100)
+
+
+class KernelsRecord(_Record):
+    """How numbers were computed: name, compiled or numpy, in the command's own process, and why.
+
+    sources: hash of the kernels' sources.    models: how many by which path, named as in manifest.jsonl.
+    """
+
+    name: str = Field(max_length=40)
+    reason: _Text = ""
+    sources: str | None = Field(default=None, max_length=100)
+    models: dict[_Path, _Count] = Field(default_factory=dict)
 
 
 class ManifestRecord(_Record):
@@ -98,6 +111,7 @@ class RunRecord(_Record):
     seconds: float = Field(default=0.0, ge=0)
     finished: str | None = Field(default=None, max_length=40)
     command: _Text | None = None
+    kernels: KernelsRecord | None = None
     manifest: ManifestRecord | None = None
     inputs: tuple[Any, ...] | None = None  # before there was a manifest
 
@@ -111,7 +125,7 @@ class PartRecord(_Record):
 
 
 class ModelRecord(_Record):
-    """One line of manifest.jsonl: a model, the state of its input, and its parts by table."""
+    """One line of manifest.jsonl: a model, the state of its input, its parts by table, and which path numbers took."""
 
     key: _Key
     dataset: _Text
@@ -122,6 +136,7 @@ class ModelRecord(_Record):
     sha256: _Text
     seconds: float = Field(ge=0)
     parts: dict[_Table, PartRecord]
+    computed_by: _Path = ""
 
     @property
     def labels(self) -> Mapping[str, str]:

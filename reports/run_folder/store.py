@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass
@@ -53,6 +55,7 @@ class RunSettings:
 
     empty_paths: those of ``paths`` in which no model was found; a folder is not bound to them.
     observations: whether a model is finished only with its table of observations.
+    kernels: which path numbers take, for run.json; a folder is not bound to it, for the numbers are the same to 1e-9.
     """
 
     version: str
@@ -60,6 +63,7 @@ class RunSettings:
     paths: Sequence[str]
     empty_paths: frozenset[str] = frozenset()
     observations: bool = False
+    kernels: Mapping[str, str | None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,7 @@ class _Part:
     state: InputState
     counts: Mapping[str, int]
     seconds: float
+    computed_by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +85,12 @@ class _Entry:
 
     line: bytes
     counts: tuple[int, ...]
+    computed_by: str
 
     @classmethod
-    def of(cls, line: bytes, counts: Mapping[str, int]) -> _Entry:
+    def of(cls, line: bytes, part: _Part) -> _Entry:
         """Keep what is needed."""
-        return cls(line, tuple(counts[name] for name in COUNTED))
+        return cls(line, tuple(part.counts[name] for name in COUNTED), sys.intern(part.computed_by))
 
 
 class RunStore:
@@ -150,15 +156,22 @@ class RunStore:
         line, part = found
         if (part.version, part.config, part.labels) != (self._settings.version, self._config(), _labels(ref)):
             return None
-        self._entries[ref.key] = _Entry.of(line, part.counts)
+        self._entries[ref.key] = _Entry.of(line, part)
         return part.state
 
-    def write(self, ref: ModelRef, state: InputState, tables: Mapping[str, pa.Table], seconds: float) -> None:
+    def write(
+        self,
+        ref: ModelRef,
+        state: InputState,
+        tables: Mapping[str, pa.Table],
+        seconds: float,
+        computed_by: str = "",
+    ) -> None:
         """Write the parts of one model; the ``models`` part, which has one row, last."""
         self.drop(ref.key)
         row = tables["models"].select(list(COUNTED))
         counts = {name: int(row[name][0].as_py()) for name in COUNTED}
-        part = _Part(self._settings.version, self._config(), _labels(ref), state, counts, seconds)
+        part = _Part(self._settings.version, self._config(), _labels(ref), state, counts, seconds, computed_by)
         metadata = {METADATA_KEY: json.dumps(asdict(part)).encode()}
         parts = {}
         for name in self._wanted:
@@ -167,11 +180,11 @@ class RunStore:
             content = buffer.getvalue()
             parts[name] = part_record(content, tables[name].num_rows)
             if name == self._wanted[-1]:  # the line is there before the part that makes the model whole
-                line = line_of(_model_record(ref, state, seconds, parts))
+                line = line_of(_model_record(ref, part, parts))
                 append_line(self.folder / MANIFEST, line)
             write_whole(part_path(self.folder, name, ref.key), [content])
         self._claims[ref.key] = line
-        self._entries[ref.key] = _Entry.of(line, counts)
+        self._entries[ref.key] = _Entry.of(line, part)
 
     def drop(self, key: str) -> None:
         """Remove a model's parts, its mark of being finished first."""
@@ -209,14 +222,17 @@ class RunStore:
             for key in self._claims.keys() - self._entries.keys():
                 found = self._intact(key)
                 if found is not None:
-                    self._entries[key] = _Entry.of(found[0], found[1].counts)
+                    self._entries[key] = _Entry.of(*found)
         kept = self._entries.keys() if keep is None else self._entries.keys() & set(keep)
         self._remove_strangers(set(kept), {report for *_, report in failures if report})
         entries = {key: entry for key, entry in sorted(self._entries.items()) if key in kept}
         totals = {name: sum(entry.counts[i] for entry in entries.values()) for i, name in enumerate(COUNTED)}
         pieces, manifest = with_hash(entry.line for entry in entries.values())
         write_whole(self.folder / MANIFEST, pieces)
+        by = Counter(entry.computed_by or "unknown" for entry in entries.values())
+        kernels = {"kernels": {**(self._settings.kernels or {}), "models": dict(sorted(by.items()))}}
         content = {
+            **(kernels if self._settings.kernels else {}),
             "counts": {"num_models": len(entries), **totals, "num_failures": len(failures)},
             "manifest": manifest.model_dump(),
             "failures": [failure._asdict() for failure in failures],
@@ -348,14 +364,15 @@ def _refuse_foreign_folder(folder: Path) -> None:
         raise RunFolderError(folder, problem, "choose a new folder with -o")
 
 
-def _model_record(ref: ModelRef, state: InputState, seconds: float, parts: Mapping[str, PartRecord]) -> ModelRecord:
+def _model_record(ref: ModelRef, part: _Part, parts: Mapping[str, PartRecord]) -> ModelRecord:
     return ModelRecord(
         key=ref.key,
-        **_labels(ref),
-        num_bytes=state.num_bytes,
-        sha256=state.digest,
-        seconds=round(seconds, 3),
+        **part.labels,
+        num_bytes=part.state.num_bytes,
+        sha256=part.state.digest,
+        seconds=round(part.seconds, 3),
         parts=dict(parts),
+        computed_by=part.computed_by,
     )
 
 

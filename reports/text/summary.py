@@ -302,13 +302,23 @@ def _limited(title: str, lines: Sequence[str], elsewhere: str, count: int) -> li
     return ["\n".join([title, *lines[:MAX_LINES], *rest])]
 
 
+def _mixed_paths(run: RunReader) -> list[str]:
+    """Say that models were computed in different ways, where they were."""
+    found = ((run.info.get("kernels") or {}).get("models")) or {}
+    if len(found) <= 1:
+        return []
+    by = ", ".join(f"{number} by {plain(path)}" for path, number in sorted(found.items()))
+    return [f"Not all models were computed alike: {by}. Numbers agree to 1e-9 (docs/kernels.md)."]
+
+
 def _closing(run: RunReader, models: _Models, page: Page) -> list[str]:
     total, accepted, rejected, undetermined = (
         models.sums[name] for name in ("num_images", "num_accepted", "num_rejected", "num_undetermined")
     )
     verdicts = f"{accepted} accepted, {rejected} rejected, {undetermined} undetermined"
     lines = [f"{counted(total, 'image')}: {verdicts}."]
-    lines += [paragraph(f"- {text}", page.width, "  ") for text in (*CAVEATS, _witnesses(models))]
+    texts = (*CAVEATS, _witnesses(models), *_mixed_paths(run))
+    lines += [paragraph(f"- {text}", page.width, "  ") for text in texts]
     stale = models.num_stale
     steps = []
     if stale:

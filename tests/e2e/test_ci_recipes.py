@@ -183,6 +183,7 @@ def test_the_steps_of_the_dockerfile_make_a_command_line(tmp_path, pip_env):
         if path.is_dir():
             shutil.copytree(path, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
         else:
+            (source / name).parent.mkdir(exist_ok=True)
             shutil.copy(path, source / name)
     site = tmp_path / "site"
     env = {**pip_env, "PATH": f"{Path(sys.executable).parent}:{pip_env['PATH']}"}

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -10,26 +11,43 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.tags import sys_tags
+from packaging.utils import parse_wheel_filename
 
 import sfm_audit
 from sfm_audit.audit.cli.main import VERBS
+from sfm_audit.audit.kernels.library import LIBRARY as LIBRARY_PATH
+from sfm_audit.audit.kernels.library import sources_hash
 
 ROOT = Path(__file__).resolve().parents[2]
 HAS_BUILDER = importlib.util.find_spec("hatchling") is not None
 needs_builder = pytest.mark.skipif(not HAS_BUILDER, reason="hatchling is not installed: the extra dev has it")
 
 
-def build(source: Path, out: Path) -> tuple[Path, Path]:
-    """Build a wheel and an sdist with the hatchling that is installed, as pip does it, without a network."""
-    command = [sys.executable, "-m", "hatchling", "build", "--directory", str(out)]
-    subprocess.run(command, cwd=source, check=True, capture_output=True)
-    (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
-    return wheel, sdist
+needs_compiler = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler")
+LIBRARY = f"sfm_audit/audit/kernels/{LIBRARY_PATH.name}"
+
+
+def build(source: Path, out: Path, target=(), **variables: str) -> tuple[list[Path], str]:
+    """Build with the hatchling that is installed, as pip does it, without a network; the files, and what was said."""
+    command = [sys.executable, "-m", "hatchling", "build", "--directory", str(out), *target]
+    env = {**os.environ, "SFM_AUDIT_KERNELS": "", **variables}
+    done = subprocess.run(command, cwd=source, env=env, check=True, capture_output=True, text=True)
+    return sorted(out.iterdir()), done.stdout + done.stderr
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    return build(ROOT, tmp_path_factory.mktemp("dist"))
+    """A wheel without compiled kernels, and an sdist."""
+    (wheel, sdist), _ = build(ROOT, tmp_path_factory.mktemp("dist"), SFM_AUDIT_KERNELS="0")
+    return wheel, sdist
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A wheel with compiled kernels."""
+    (wheel,), _ = build(ROOT, tmp_path_factory.mktemp("compiled"), ("--target", "wheel"), SFM_AUDIT_KERNELS="1")
+    return wheel
 
 
 def top_names(names):
@@ -81,7 +99,9 @@ def test_an_sdist_builds_the_same_wheel(built, tmp_path):
         assert all(member.isfile() for member in archive)  # no links: not every system unpacks them
         archive.extractall(tmp_path, filter="data")
     (source,) = tmp_path.iterdir()
-    again, sdist_again = build(source, tmp_path / "dist")
+    # as on a machine without a compiler: neither a variable nor a failure, the same pure wheel and one warning
+    (again, sdist_again), said = build(source, tmp_path / "dist", PATH=str(tmp_path / "nothing"), CC="")
+    assert said.count("sfm-audit is installed without compiled kernels (slower): no C compiler") == 1
     with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(again) as two:
         first = {name: one.read(name) for name in one.namelist() if not name.endswith("/RECORD")}
         second = {name: two.read(name) for name in two.namelist() if not name.endswith("/RECORD")}
@@ -89,6 +109,50 @@ def test_an_sdist_builds_the_same_wheel(built, tmp_path):
     assert [name for name in first if first[name] != second[name]] == []
     with tarfile.open(sdist) as one, tarfile.open(sdist_again) as two:
         assert sorted(one.getnames()) == sorted(two.getnames())
+
+
+@needs_builder
+@needs_compiler
+def test_a_wheel_with_kernels_says_where_it_runs_and_uses_them(built, compiled, tmp_path):
+    pure = built[0]
+    assert pure.name.endswith("-py3-none-any.whl")
+    (tag,) = parse_wheel_filename(compiled.name)[3]
+    assert tag in set(sys_tags())
+    with zipfile.ZipFile(pure) as one, zipfile.ZipFile(compiled) as other:
+        assert set(other.namelist()) - set(one.namelist()) == {LIBRARY}
+        other.extractall(tmp_path)  # noqa: S202 - built here
+    check = [sys.executable, str(ROOT / "scripts" / "check_wheel.py"), str(compiled)]
+    assert subprocess.run(check, capture_output=True, check=False).returncode == 0
+    code = "from sfm_audit.audit.kernels import path_taken; print(path_taken().name)"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path), "SFM_AUDIT_KERNELS": "1"}
+    said = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, env=env, text=True)
+    assert said == "compiled\n"
+
+
+@needs_builder
+@needs_compiler
+def test_the_check_sees_a_library_of_other_sources_and_a_name_that_promises_too_much(compiled, tmp_path):
+    wrong = tmp_path / re.sub(r"none-.*", "none-manylinux_2_5_x86_64.whl", compiled.name)
+    with zipfile.ZipFile(compiled) as good, zipfile.ZipFile(wrong, "w") as bad:
+        for name in good.namelist():
+            data = good.read(name)
+            bad.writestr(name, data.replace(sources_hash().encode(), b"0" * 64) if name == LIBRARY else data)
+    command = [sys.executable, str(ROOT / "scripts" / "check_wheel.py"), str(wrong)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    one, two = done.stderr.splitlines()
+    assert one == f"{wrong.name}: {LIBRARY} is of other sources"
+    assert two.startswith(f"{wrong.name}: its library is one for py3-none-")
+
+
+@needs_builder
+def test_a_compiler_that_fails_is_a_warning_unless_kernels_are_insisted_on(tmp_path):
+    (wheel,), said = build(ROOT, tmp_path / "tried", ("--target", "wheel"), CC="false")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    assert said.count("without compiled kernels (slower): false failed") == 1
+    with pytest.raises(subprocess.CalledProcessError) as error:
+        build(ROOT, tmp_path / "insisted", ("--target", "wheel"), CC="false", SFM_AUDIT_KERNELS="1")
+    assert "SFM_AUDIT_KERNELS=1, but there are no compiled kernels: false failed" in error.value.stderr
 
 
 @pytest.fixture(scope="module")

@@ -253,3 +253,75 @@ def test_the_extra_for_tests_holds_all_others(checkout):
     checkout.log()
     assert checkout.run("report", "RUN", script="sfm-audit").stderr == ""
     assert checkout.log() == []
+
+
+COMPILER = """#!/bin/sh
+[ -z "${FAKE_CC_FAILS-}" ] || { echo "no such header" >&2; exit 1; }
+echo built >>"$FAKE_LOG"
+while [ "$1" != -o ]; do case $1 in -DSFM_SOURCES=*) hash=$1 ;; esac; shift; done
+printf '%s' "$hash" >"$2"
+"""
+
+
+@pytest.fixture
+def with_kernels(checkout, tmp_path):
+    """A checkout with C sources, and a stand-in for the compiler."""
+    shutil.copy(SCRIPTS / "build_kernels.py", checkout.root / "scripts")
+    (checkout.root / "audit/kernels/source").mkdir(parents=True)
+    (checkout.root / "audit/kernels/source/version.c").write_text("/* one */\n")
+    (checkout.root / "sfm_audit").mkdir()
+    (checkout.root / "sfm_audit/audit").symlink_to("../audit")
+    checkout.env["CC"] = str(executable(tmp_path / "compile", COMPILER)).replace(" ", "\\ ")
+    return checkout
+
+
+def later(path, library):
+    """Give a file a time of change after that of the library."""
+    os.utime(path, ns=(library.stat().st_mtime_ns + 10**9,) * 2)
+
+
+def library_of(checkout):
+    return next(path for path in (checkout.root / "audit/kernels").glob("compiled.*"))
+
+
+def test_compiled_kernels_follow_their_sources(with_kernels):
+    source = with_kernels.root / "audit/kernels/source/version.c"
+    assert with_kernels.run("dev").returncode == 0
+    assert with_kernels.log() == ["venv", ".[dev]", "built"]
+    library = library_of(with_kernels)
+    later(source, library)
+    assert with_kernels.run("dev").stderr == ""  # newer, but what it was
+    assert with_kernels.log() == []
+    os.utime(library)
+    source.write_text("/* two */\n")
+    later(source, library)
+    for extra in ("base", "base", "dev"):  # whoever has a library has one of these sources
+        assert with_kernels.run(extra, "tool").returncode == 3
+    assert with_kernels.log() == ["built"]
+
+
+def test_a_compiler_that_fails_stops_a_developer_and_nobody_else(with_kernels):
+    done = with_kernels.run("dev", FAKE_CC_FAILS="1")
+    assert done.returncode == UNAVAILABLE
+    assert "no such header" in done.stderr
+    assert "SFM_AUDIT_KERNELS=0" in done.stderr
+    assert with_kernels.run("dev", FAKE_CC_FAILS="1", SFM_AUDIT_KERNELS="0").returncode == 0
+    assert with_kernels.run("dev").returncode == 0
+    source = with_kernels.root / "audit/kernels/source/version.c"
+    source.write_text("/* two */\n")
+    later(source, library_of(with_kernels))
+    with_kernels.log()
+    done = with_kernels.run("base", "tool", FAKE_CC_FAILS="1")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    done = with_kernels.run("base", "tool", FAKE_CC_FAILS="1")  # and it is not tried again
+    assert (done.returncode, done.stderr) == (3, "")
+
+
+def test_without_a_compiler_nothing_is_said(with_kernels, tmp_path):
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for name in ("cat", "cmp", "cp", "env", "find", "mkdir", "readlink", "rm", "sh", "sleep", "chmod"):
+        (tools / name).symlink_to(shutil.which(name))
+    done = with_kernels.run("dev", "tool", PATH=str(tools), CC="")
+    assert (done.returncode, done.stderr) == (3, "Installing into .venv (first use, about a minute) ...\n")
+    assert with_kernels.log() == ["venv", ".[dev]"]

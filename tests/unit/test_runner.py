@@ -25,8 +25,9 @@ class Memory:
     def finished(self, ref):
         return self.states.get(ref.key)
 
-    def write(self, ref, state, tables, seconds):
+    def write(self, ref, state, tables, seconds, computed_by=""):
         assert seconds > 0
+        assert computed_by
         self.states[ref.key] = state
         self.tables[ref.key] = tables
 
