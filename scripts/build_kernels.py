@@ -27,7 +27,7 @@ SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = SOURCES.parent / f"compiled{SUFFIX}"
 # Fixed summation order: nothing that lets a compiler reorder or fuse. The rest does not change what is computed.
 FLAGS = ["-std=gnu99", "-O3", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
-WARNINGS = ["-Wall", "-Wextra", "-Werror=implicit-function-declaration"]
+WARNINGS = ["-Wall", "-Wextra", "-Werror=implicit-function-declaration", "-Wno-psabi"]
 COMPILERS = ("cc", "gcc", "clang")
 NO_COMPILER = f"no C compiler ({', '.join(COMPILERS)}, or CC)"
 LIMIT_SECONDS = 600

@@ -26,7 +26,8 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks, scale_only_noise
-from sfm_audit.audit.noise.predictive import TrackStandardiser, fit_track_prior, predict
+from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
+from sfm_audit.audit.noise.prior import fit_track_prior
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
 from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
 from sfm_audit.audit.normality import normality_tests

@@ -34,7 +34,7 @@ from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_
 from sfm_audit.audit.normality import NormalityTests, normality_tests, normality_tests_of
 from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, Int32Array
 from sfm_audit.loaders.model import ImageRecord, InlierSet
 
 _MAX_VALUES_AT_ONCE: Final = 1 << 16
@@ -63,7 +63,7 @@ class ImageEvidence:
     pose_offset_px: float
     constant: ImageNoise
     chosen: ImageNoise
-    track_length: IntArray | None = None
+    track_length: Int32Array | None = None
     quality: CameraQuality | None = None
     misfit: MisfitDiagnostics | None = None
     retest: Retest | None = None
@@ -94,7 +94,7 @@ class ImageAudit:
 
     inliers: InlierSet
     residuals_px: FloatArray
-    track_length: IntArray | None
+    track_length: Int32Array | None
     noise: ImageNoise
     tests: NormalityTests
     constant: ImageNoise

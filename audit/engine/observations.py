@@ -11,7 +11,7 @@ import pyarrow as pa
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.table import ModelLabels, schema
 from sfm_audit.audit.table.arrow import Coded, build_table
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 Standardised = Callable[[int], tuple[IntArray, FloatArray]]
@@ -21,7 +21,7 @@ Standardised = Callable[[int], tuple[IntArray, FloatArray]]
 def observation_table(
     model: SparseModel,
     residuals: ModelResiduals,
-    track_length: IntArray,
+    track_length: Int32Array,
     standardised: Standardised,
     labels: ModelLabels,
 ) -> pa.Table:

@@ -30,7 +30,7 @@ from scipy import special
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.fits import fit_variance
-from sfm_audit.audit.noise.predictive import NU0_RANGE
+from sfm_audit.audit.noise.prior import NU0_RANGE
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 

@@ -13,183 +13,13 @@ import numpy as np
 from scipy import special
 
 from sfm_audit.audit.noise.fits import CONSISTENCY, CUTOFF
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.noise.prior import TrackPrior
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
-MIN_OBSERVATIONS = 20
-NU0_RANGE = (0.1, 1e4)
-_CHUNK = 1 << 15
 _MAX_ITERATIONS = 60
-_MAX_RADIUS = 2.0  # of a step in (ln nu0, ln s0^2)
-_CONVERGED_NATS = 1e-8  # predicted gain of the last step, which is still taken
 _STEP = 1.0 / 32.0  # node distance of the quantile tables in w
 _TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
 _NUM_CELLS = round(_TABLE_END / _STEP)
-
-
-@dataclass(frozen=True, slots=True)
-class TrackPrior:
-    """How track variances scatter over a model: s0^2 nu0 / chi^2(nu0); NaN where it could not be fitted.
-
-    converged: whether (nu0, s0) is a maximum of the likelihood, possibly at a bound of nu0.
-    """
-
-    nu0: float
-    s0_px: float
-    converged: bool
-
-
-def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: IntArray) -> TrackPrior:
-    """Fit (nu0, s0) by maximum likelihood over all verified observations of a model.
-
-    Parameters
-    ----------
-    sq_px2 : (m,) q = |e_k|^2          other_sq_px2 : (m,) c = nu_k a_k^2 of (3)          other_dof : (m,) nu_k
-
-    Returns
-    -------
-    TrackPrior
-        NaN with fewer than 20 observations, where all residuals are zero, and where their sums or the likelihood
-        are not finite; 0.1 <= nu0 <= 1e4.
-
-    Notes
-    -----
-    With P = nu0 s0^2, B = P + c and nu = nu0 + nu_k the log likelihood of method.md (4) is
-    sum ln nu + nu / 2 ln B - (nu / 2 + 1) ln(B + q): two logarithms an observation, and a 2 x 2 Hessian in closed
-    form. Newton in (ln nu0, ln s0^2) from a coarse grid, first on a systematic subsample (`_maximise`).
-    """
-    with np.errstate(over="ignore"):
-        total_sq_px2 = float(sq_px2.sum() + other_sq_px2.sum())
-    if sq_px2.size < MIN_OBSERVATIONS or not sq_px2.any() or not math.isfinite(total_sq_px2):
-        return TrackPrior(math.nan, math.nan, converged=False)
-    dof = other_dof.astype(np.float64)
-    stride = max(1, sq_px2.size // 20_000)
-    sample = sq_px2[::stride], other_sq_px2[::stride], dof[::stride]
-    grid = [
-        np.array([math.log(nu0), math.log(s0_sq)])
-        for s0_sq in _scale_grid(*sample)
-        for nu0 in (0.3, 1.0, 3.0, 10.0, 100.0)
-    ]
-    best = max(grid, key=lambda x: _log_likelihood(x, *sample).value)
-    found = _maximise(best, *sample)
-    if stride > 1:
-        found = _maximise(found.x, sq_px2, other_sq_px2, dof)
-    if not math.isfinite(found.value):
-        return TrackPrior(math.nan, math.nan, converged=False)
-    return TrackPrior(math.exp(found.x[0]), math.exp(0.5 * found.x[1]), found.converged)
-
-
-def _scale_grid(sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> list[float]:
-    """Plausible s0^2: around the pooled variance per degree of freedom and the median of |e|^2 / 2."""
-    centre = max(float(np.median(sq)) / (2.0 * math.log(2.0)), np.finfo(np.float64).tiny)
-    pooled = max(float((sq + other_sq).sum() / (dof + 2.0).sum()), centre)
-    return [centre * 0.3, centre, pooled]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Likelihood:
-    """Log likelihood (nats) at a point, gradient (2,) and Hessian (2, 2) in x = (ln nu0, ln s0^2)."""
-
-    value: float
-    gradient: FloatArray
-    hessian: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Maximum:
-    """Where the ascent ended, x (2,), the log likelihood there before the last step, and whether it is a maximum."""
-
-    x: FloatArray
-    value: float
-    converged: bool
-
-
-def _maximise(start: FloatArray, sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> _Maximum:
-    """Newton ascent within a trust radius in x = (ln nu0, ln s0^2).
-
-    Notes
-    -----
-    Towards equal tracks (nu0 to infinity) the likelihood levels off along a ridge of constant s0, where its Hessian is
-    indefinite; in these coordinates the ridge follows an axis, and `_ascent_step` goes along it. A step that gains less
-    than a tenth of what the quadratic predicts is not taken, and the radius shrinks.
-    """
-    low, high = math.log(NU0_RANGE[0]), math.log(NU0_RANGE[1])
-    x, here, radius = start, _log_likelihood(start, sq, other_sq, dof), _MAX_RADIUS
-    for _ in range(_MAX_ITERATIONS):
-        if not np.isfinite(here.hessian).all():
-            return _Maximum(x, math.nan, converged=False)
-        held = (x[0] <= low and here.gradient[0] < 0) or (x[0] >= high and here.gradient[0] > 0)
-        step, gain, concave = _ascent_step(here.gradient, here.hessian, hold_first=held)
-        if concave and gain <= _CONVERGED_NATS:
-            return _Maximum(_on_range(x + step), here.value, converged=True)
-        length = max(math.hypot(*step), 1e-300)
-        trial = _on_range(x + step * min(1.0, radius / length))
-        there = _log_likelihood(trial, sq, other_sq, dof)
-        moved = trial - x
-        predicted = float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved)
-        rounding = 1e-13 * (abs(here.value) + sq.size)
-        if there.value - here.value >= 0.1 * max(predicted, 0.0) - rounding:
-            x, here = trial, there
-            radius = min(2.0 * radius, _MAX_RADIUS)
-        else:  # also where the likelihood is not finite
-            radius = 0.25 * min(radius, length)
-    return _Maximum(x, here.value, converged=False)
-
-
-def _on_range(x: FloatArray) -> FloatArray:
-    """Return the nearest x whose nu0 is in its range; s0 stays."""
-    return np.array([min(max(x[0], math.log(NU0_RANGE[0])), math.log(NU0_RANGE[1])), x[1]])
-
-
-def _ascent_step(gradient: FloatArray, hessian: FloatArray, *, hold_first: bool) -> tuple[FloatArray, float, bool]:
-    """Return Newton's step with the eigenvalues' absolute values, its gain (nats), and whether the Hessian is negative.
-
-    Where the Hessian is negative definite this is Newton's step; along a direction of positive curvature it goes
-    uphill, away from the saddle, as far as the curvature's scale says.
-    """
-    free = slice(1, 2) if hold_first else slice(0, 2)
-    curvature, axes = np.linalg.eigh(hessian[free, free])
-    scale = np.maximum(np.abs(curvature), 1e-12 * max(float(np.abs(hessian).max()), 1e-300))
-    along = axes.T @ gradient[free]
-    step = np.zeros(2)
-    step[free] = axes @ (along / scale)
-    return step, 0.5 * float(along @ (along / scale)), bool((curvature < 0).all())
-
-
-def _log_likelihood(x: FloatArray, sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> _Likelihood:
-    """Log likelihood of (4) with its derivatives at x = (ln nu0, ln s0^2)."""
-    nu0, prior_sq = math.exp(x[0]), math.exp(x[0] + x[1])
-    with np.errstate(all="ignore"):  # not finite where tracks without residuals pull s0 to 0: no step goes there
-        total = _sums(nu0, prior_sq, sq, other_sq, dof)
-        value, d_nu, d_p, d_nu_nu, d_nu_p, d_p_p = total
-        first, second = d_nu * nu0, d_p * prior_sq  # by ln nu0, ln P; then by ln nu0, ln s0^2 = ln P - ln nu0
-        mixed = d_nu_p * nu0 * prior_sq
-        of_nu, of_p = d_nu_nu * nu0**2 + first, d_p_p * prior_sq * prior_sq + second
-    gradient = np.array([first + second, second])
-    hessian = np.array([[of_nu + 2.0 * mixed + of_p, mixed + of_p], [mixed + of_p, of_p]])
-    return _Likelihood(float(value), gradient, hessian)
-
-
-def _sums(nu0: float, prior_sq: float, sq: FloatArray, other_sq: FloatArray, dof: FloatArray) -> FloatArray:
-    """Log likelihood and its derivatives by nu0, P, nu0 nu0, nu0 P, P P: (6,); one pass, in chunks that fit a cache."""
-    total = np.zeros(6)
-    for start in range(0, sq.size, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        nu = dof[part] + nu0
-        b = other_sq[part] + prior_sq
-        bq = b + sq[part]
-        inv_b, inv_bq, inv_nu = 1.0 / b, 1.0 / bq, 1.0 / nu
-        log_b, log_bq = np.log(b), np.log(bq)
-        difference = log_b - log_bq
-        half = 0.5 * nu
-        total += (
-            np.log(nu).sum() + half @ difference - log_bq.sum(),
-            inv_nu.sum() + 0.5 * difference.sum(),  # d / d nu0
-            half @ inv_b - (half + 1.0) @ inv_bq,  # d / d P
-            -(inv_nu @ inv_nu),  # d2 / d nu0^2
-            0.5 * (inv_b.sum() - inv_bq.sum()),  # d2 / d nu0 d P
-            (half + 1.0) @ (inv_bq * inv_bq) - half @ (inv_b * inv_b),  # d2 / d P^2
-        )
-    return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,13 +31,13 @@ class Prediction:
 
     scale_px: FloatArray
     nu_values: FloatArray
-    nu_row: IntArray
+    nu_row: Int32Array
 
 
-def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: IntArray) -> Prediction:
+def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: Int32Array | IntArray) -> Prediction:
     """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4)."""
     distinct = np.flatnonzero(np.bincount(other_dof))  # small positive integers: no need to sort two million of them
-    row_of = np.zeros(int(distinct[-1]) + 1 if distinct.size else 1, dtype=np.int64)
+    row_of = np.zeros(int(distinct[-1]) + 1 if distinct.size else 1, dtype=np.int32)
     row_of[distinct] = np.arange(distinct.size)
     row = row_of[other_dof]
     nu = prior.nu0 + distinct.astype(np.float64)
@@ -236,7 +66,7 @@ class StudentToNormal:
         cubic = [left, left_slope, 3.0 * rise - 2.0 * left_slope - right_slope, left_slope + right_slope - 2.0 * rise]
         self._coefficients = np.stack(cubic, axis=-1).reshape(-1, 4)
 
-    def __call__(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+    def __call__(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         """Transform t (m,) with degrees of freedom nu (m,) = nu_values[nu_row]."""
         w = np.sqrt(nu * np.log1p(t * t / nu))
         cell_position = w * (1.0 / _STEP)
@@ -346,12 +176,12 @@ class TrackStandardiser:
             log_f = _inside(log_f, step, low, high)
         return StandardisedImage(z, math.exp(log_f), converged=False)
 
-    def transform_stack(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+    def transform_stack(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         """Return z (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m) = nu_values[nu_row]."""
         flat = np.ascontiguousarray(t.transpose(1, 0, 2)).reshape(2, -1)
         return self._transform(flat, nu_row.reshape(-1), nu.reshape(-1)).reshape(*nu.shape, 2)
 
-    def _transform(self, t: FloatArray, nu_row: IntArray, nu: FloatArray) -> FloatArray:
+    def _transform(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         z = np.empty((t.shape[1], 2))
         z[:, 0] = self.first(t[0], nu_row, nu)
         z[:, 1] = self.second(t[1] * np.sqrt((nu + 1.0) / (nu + t[0] * t[0])), nu_row, nu + 1.0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
-from sfm_audit.audit.noise.predictive import TrackPrior, TrackStandardiser, fit_track_prior, predict
+from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
+from sfm_audit.audit.noise.prior import TrackPrior, fit_track_prior
 from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
@@ -75,26 +76,21 @@ def model_tracks(
     out of the tracks of all others and of the prior; its own observations keep the values of the full tracks. If more
     than half of the images (with inliers) exceed it, none is left out.
     """
-
-    def statistics_of(rows: BoolArray | slice) -> TrackStatistics:
-        return track_statistics(
-            residuals.residuals_px[:, rows],
-            residuals.point_jacobian[:, :, rows],
-            residuals.point_idx[rows],
-            num_points,
-            min_track_length=min_track_length,
-            min_eigenvalue=min_eigenvalue,
-        )
-
     moved = residuals.pose_offset_px > pose_offset_threshold_px
     num_audited = int(np.count_nonzero(np.diff(residuals.offsets)))
     too_many = bool(2 * np.count_nonzero(moved) > num_audited)
     left_out = np.zeros_like(moved) if too_many else moved
-    statistics = statistics_of(slice(None))
-    kept = np.repeat(~left_out, np.diff(residuals.offsets))
-    if left_out.any():
-        statistics = _replace_rows(statistics, kept, statistics_of(kept))
-    used = statistics.verified & kept
+    own_left_out = np.repeat(left_out, np.diff(residuals.offsets))
+    statistics = track_statistics(
+        residuals.residuals_px,
+        residuals.point_jacobian,
+        residuals.point_idx,
+        num_points,
+        min_track_length=min_track_length,
+        min_eigenvalue=min_eigenvalue,
+        left_out=own_left_out,
+    )
+    used = statistics.verified & ~own_left_out
     sq = (statistics.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
     prior = fit_track_prior(sq, statistics.other_sq_px2[used], statistics.other_dof[used])
     standardiser = None
@@ -106,28 +102,6 @@ def model_tracks(
     verified_before = np.concatenate([[0], np.cumsum(statistics.verified)])
     return ModelTracks(
         statistics, moved, too_many, residuals.offsets, verified_before[residuals.offsets], prior, standardiser
-    )
-
-
-def _replace_rows(full: TrackStatistics, rows: BoolArray, part: TrackStatistics) -> TrackStatistics:
-    """Return the statistics of ``part`` in ``rows``, of ``full`` elsewhere; the model's sums of squares of ``part``."""
-    whitened, verified, length, other_sq, other_dof = (
-        full.whitened_px.copy(),
-        full.verified.copy(),
-        full.track_length.copy(),
-        full.other_sq_px2.copy(),
-        full.other_dof.copy(),
-    )
-    whitened[:, rows] = part.whitened_px
-    verified[rows], length[rows] = part.verified, part.track_length
-    other_sq[rows], other_dof[rows] = part.other_sq_px2, part.other_dof
-    return replace(
-        part,
-        whitened_px=whitened,
-        verified=verified,
-        track_length=length,
-        other_sq_px2=other_sq,
-        other_dof=other_dof,
     )
 
 

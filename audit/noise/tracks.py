@@ -5,11 +5,12 @@ Everything works on all observations of a model at once; ``point_idx`` ties an o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.kernels import tracks as compiled
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 _SUFFICIENT_DETERMINANT = 1e-6  # of the information matrix with unit diagonal: closed-form inverse, else eigenvectors
 _RANK_THRESHOLD = 1e-10  # eigenvalues of that matrix, relative to the largest: singular values of J below 1e-5
@@ -32,9 +33,9 @@ class TrackStatistics:
 
     whitened_px: FloatArray
     verified: BoolArray
-    track_length: IntArray
+    track_length: Int32Array
     other_sq_px2: FloatArray
-    other_dof: IntArray
+    other_dof: Int32Array
     removable_sq_px2: float
     total_sq_px2: float
 
@@ -47,6 +48,7 @@ def track_statistics(
     *,
     min_track_length: int = 3,
     min_eigenvalue: float = 0.05,
+    left_out: BoolArray | None = None,
 ) -> TrackStatistics:
     r"""Whiten residuals whose 3D points were triangulated from them, and take each track's sum of squares without it.
 
@@ -55,6 +57,8 @@ def track_statistics(
     residuals_px : (2, n)         observed minus projected, px
     point_jacobian : (2, 3, n)    d projection / d point, px per model unit
     point_idx : (n,)              row of the 3D point of each observation
+    left_out : (n,)               observations that the tracks of the others do without; their own values are those of
+                                  the full tracks, and the model's sums of squares do without them
 
     Notes
     -----
@@ -66,11 +70,68 @@ def track_statistics(
 
     Cameras are treated as exact: their share of the leverage is 8 / 2n of an image, and is left in.
     """
+    limits = (min_track_length, min_eigenvalue)
+    some_left_out = left_out is not None and left_out.any()
+    if compiled.available():
+        return _compiled(
+            (residuals_px, point_jacobian, point_idx), num_points, limits, left_out if some_left_out else None
+        )
+    full = _statistics(residuals_px, point_jacobian, point_idx, num_points, limits)
+    if left_out is None or not some_left_out:
+        return full
+    kept = ~left_out
+    rows = residuals_px[:, kept], point_jacobian[:, :, kept], point_idx[kept]
+    return _replace_rows(full, kept, _statistics(*rows, num_points, limits))
+
+
+def _compiled(
+    observations: tuple[FloatArray, FloatArray, IntArray],
+    num_points: int,
+    limits: tuple[int, float],
+    left_out: BoolArray | None,
+) -> TrackStatistics:
+    """`track_statistics` by the compiled kernels; tracks of which a point is not well determined are inverted here."""
+    residuals_px, point_jacobian = (np.ascontiguousarray(array) for array in observations[:2])
+    point_idx = np.ascontiguousarray(observations[2])
+    n = point_idx.size
+    used = [np.ones(n, dtype=np.bool_)] + ([] if left_out is None else [~left_out])
+    out = compiled.Whitened.of_size(n)
+    removable = total = 0.0
+    for rows in used:  # the second writes over what the first said of them
+        points = compiled.sums(residuals_px, point_jacobian, point_idx, rows, num_points)
+        singular = points.invert(_SUFFICIENT_DETERMINANT)
+        if singular.size:
+            inverse, rank = _inverses(points.columns[singular, :6].T)
+            points.columns[singular, 6:9] = symmetric_times(inverse, points.columns[singular, 6:9].T).T
+            points.columns[singular, :6], points.rank[singular] = inverse.T, rank
+        removable, total = points.whiten((residuals_px, point_jacobian, point_idx), rows, limits, out)
+    return TrackStatistics(
+        out.whitened_px, out.verified, out.track_length, out.other_sq_px2, out.other_dof, removable, total
+    )
+
+
+def _replace_rows(full: TrackStatistics, rows: BoolArray, part: TrackStatistics) -> TrackStatistics:
+    """Return the statistics of ``part`` in ``rows``, of ``full`` elsewhere; the model's sums of squares of ``part``."""
+    full.whitened_px[:, rows] = part.whitened_px
+    full.verified[rows], full.track_length[rows] = part.verified, part.track_length
+    full.other_sq_px2[rows], full.other_dof[rows] = part.other_sq_px2, part.other_dof
+    return replace(full, removable_sq_px2=part.removable_sq_px2, total_sq_px2=part.total_sq_px2)
+
+
+def _statistics(
+    residuals_px: FloatArray,
+    point_jacobian: FloatArray,
+    point_idx: IntArray,
+    num_points: int,
+    limits: tuple[int, float],
+) -> TrackStatistics:
+    """`track_statistics` of all observations, by numpy; limits: min_track_length, min_eigenvalue."""
+    min_track_length, min_eigenvalue = limits
     n = residuals_px.shape[1]
     differentiable = _finite_columns(point_jacobian)
     if not differentiable.all():
         point_jacobian = np.where(differentiable, point_jacobian, 0.0)
-    length = np.bincount(point_idx, minlength=num_points)
+    length = np.bincount(point_idx, minlength=num_points).astype(np.int32)
     inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
     projected, complement, removable = _project_off_points(residuals_px, point_jacobian, point_idx, inverse)
     square = _squared_lengths(projected)
@@ -192,13 +253,18 @@ def symmetric_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 def inverse_information(
     point_jacobian: FloatArray, point_idx: IntArray, num_points: int
-) -> tuple[FloatArray, IntArray]:
+) -> tuple[FloatArray, Int32Array]:
     """Return the (pseudo-)inverse (6, P) of each track's information A = sum J^T J, and its rank (P,)."""
     information = np.empty((6, num_points))
     product = np.empty(point_idx.size)
     for row, (i, j) in enumerate(_SYMMETRIC):
         _sum_of_two_products(point_jacobian[:, i], point_jacobian[:, j], product)
         information[row] = sum_by_point(product, point_idx, num_points)
+    return _inverses(information)
+
+
+def _inverses(information: FloatArray) -> tuple[FloatArray, Int32Array]:
+    """(Pseudo-)inverses (6, P) of symmetric 3x3 matrices (6, P), and their ranks (P,)."""
     scale = np.sqrt(information[[0, 3, 5]])
     scale[scale == 0] = 1.0
     xx, xy, xz, yy, yz, zz = (information[row] / (scale[i] * scale[j]) for row, (i, j) in enumerate(_SYMMETRIC))
@@ -215,7 +281,7 @@ def inverse_information(
     determinant = xx * cofactor[0] + xy * cofactor[1] + xz * cofactor[2]
     regular = determinant > _SUFFICIENT_DETERMINANT
     inverse = cofactor / np.where(regular, determinant, 1.0)
-    rank = np.full(num_points, 3, dtype=np.int64)
+    rank = np.full(regular.shape, 3, dtype=np.int32)
     singular = np.flatnonzero(~regular)
     if singular.size:
         full = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[:, :, singular].transpose(2, 0, 1)

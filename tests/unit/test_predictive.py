@@ -13,11 +13,10 @@ from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.predictive import (
     StudentToNormal,
     TrackStandardiser,
-    _maximise,
-    fit_track_prior,
     predict,
     student_to_normal,
 )
+from sfm_audit.audit.noise.prior import _maximise, _sums_of, fit_track_prior
 
 
 def simulate(rng, num, nu0, s0):
@@ -108,7 +107,7 @@ def test_a_start_on_a_bound_does_not_end_there(nu0, s0_sq):
     e, other, dof = simulate(np.random.default_rng(11), 20_000, 5.0, 0.5)
     sq = (e**2).sum(axis=0)
     prior = fit_track_prior(sq, other, dof)
-    found = _maximise(np.log([nu0, s0_sq]), sq, other, dof.astype(np.float64))
+    found = _maximise(np.log([nu0, s0_sq]), _sums_of(sq, other, dof), sq.size)
     assert found.converged
     assert_allclose(np.exp(found.x), [prior.nu0, prior.s0_px**2], rtol=1e-6)
 

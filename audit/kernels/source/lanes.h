@@ -1,0 +1,76 @@
+/* Four numbers at a time, in the vector notation of gcc and clang, and the functions of them that libm has not. */
+#ifndef SFM_AUDIT_LANES_H
+#define SFM_AUDIT_LANES_H
+
+#include "kernel.h"
+
+enum { LANES = 4 };
+typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
+typedef int64_t LaneBits __attribute__((vector_size(LANES * sizeof(int64_t))));
+#define INLINE static inline __attribute__((always_inline))
+#pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes lanes is inlined */
+
+INLINE Lanes load(const double *from)
+{
+    Lanes x;
+    memcpy(&x, from, sizeof x);
+    return x;
+}
+
+INLINE void store(double *to, Lanes x) { memcpy(to, &x, sizeof x); }
+INLINE Lanes all(double x) { return (Lanes){x, x, x, x}; }
+INLINE double sum(Lanes x) { return (x[0] + x[1]) + (x[2] + x[3]); }
+
+INLINE int64_t total(LaneBits x) { return x[0] + x[1] + x[2] + x[3]; }
+
+/* Where yes (all bits) a, elsewhere b. */
+INLINE Lanes choose(LaneBits yes, Lanes a, Lanes b)
+{
+    return (Lanes)((yes & (LaneBits)a) | (~yes & (LaneBits)b));
+}
+
+INLINE Lanes root(Lanes x)
+{
+    Lanes out;
+    for (int l = 0; l < LANES; l++)
+        out[l] = sqrt(x[l]);
+    return out;
+}
+
+/* Of positive normal numbers: a number in [1, 2), and the exponent with its bias of 1023. */
+INLINE Lanes mantissa(Lanes x) { return (Lanes)(((LaneBits)x & 0x000fffffffffffff) | 0x3ff0000000000000); }
+INLINE LaneBits biased_exponent(Lanes x) { return ((LaneBits)x >> 52) & 0x7ff; }
+
+/* ln(1 + u), u >= 0, 1 + u finite, to 1e-15 of itself. */
+INLINE Lanes log_1p(Lanes u)
+{
+    const Lanes s = 1.0 + u, lost = (u - (s - 1.0)) / s;
+    Lanes m = mantissa(s);
+    const LaneBits upper = m > 1.4142135623730951;
+    m = choose(upper, 0.5 * m, m);
+    const LaneBits e = biased_exponent(s) - upper; /* true is -1 */
+    const Lanes exponent = (Lanes)(e | 0x4330000000000000) - (4503599627370496.0 + 1023.0);
+    const Lanes f = (m - 1.0) / (m + 1.0), t = f * f; /* ln m = 2 (f + f^3 / 3 + f^5 / 5 ...), t < 0.0295 */
+    Lanes p = all(1.0 / 21.0);
+    for (int k = 19; k > 1; k -= 2)
+        p = p * t + 1.0 / k;
+    return exponent * 0.693147180369123816490 + (2.0 * f + (2.0 * f * t * p + (exponent * 1.90821492927058770002e-10 + lost)));
+}
+
+/* exp(x), x <= 0; 0 below -708. */
+INLINE Lanes exp_of_negative(Lanes x)
+{
+    const LaneBits gone = x < -708.0;
+    x = choose(gone, all(0.0), x);
+    const Lanes shifted = x * 1.4426950408889634 + 6755399441055744.0; /* 1.5 * 2^52: its last bits are a whole number */
+    const Lanes k = shifted - 6755399441055744.0;
+    const Lanes r = (x - k * 0.693147180369123816490) - k * 1.90821492927058770002e-10; /* |r| <= 0.347 */
+    static const double by_factorial[] = {1.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24, 1.0 / 120, 1.0 / 720, 1.0 / 5040,
+                                          1.0 / 40320, 1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800, 1.0 / 479001600};
+    Lanes p = all(1.0 / 6227020800.0);
+    for (int i = 12; i >= 0; i--)
+        p = p * r + by_factorial[i];
+    return choose(gone, all(0.0), (Lanes)((LaneBits)p + ((LaneBits)shifted << 52)));
+}
+
+#endif
