@@ -26,7 +26,16 @@ SOURCES = ROOT / "sfm_audit" / "audit" / "kernels" / "source"
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 LIBRARY = SOURCES.parent / f"compiled{SUFFIX}"
 # Fixed summation order: nothing that lets a compiler reorder or fuse. The rest does not change what is computed.
-FLAGS = ["-std=gnu99", "-O3", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
+# Without -fno-trapping-math a division or comparison in a choice (x > 0 ? 1 / x : y) makes loops scalar.
+FLAGS = [
+    "-std=gnu99",
+    "-O3",
+    "-fno-trapping-math",
+    "-shared",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fvisibility=hidden",
+]
 WARNINGS = ["-Wall", "-Wextra", "-Werror=implicit-function-declaration", "-Wno-psabi"]
 COMPILERS = ("cc", "gcc", "clang")
 NO_COMPILER = f"no C compiler ({', '.join(COMPILERS)}, or CC)"

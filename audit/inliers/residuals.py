@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
 from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
+from sfm_audit.audit.inliers.kept import Kept
 from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_differentiable, is_sane, is_usable
 from sfm_audit.audit.inliers.stationarity import pose_offset_px, pose_offsets_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -189,43 +190,48 @@ class _PoseOffsets:
 
 
 def model_residuals(model: SparseModel) -> ModelResiduals:
-    """Return the inliers of all images with their residuals; one pass over the images, arrays throughout."""
+    """Return the inliers of all images with their residuals; arrays throughout, each observation projected once."""
     observations = model.observations
-    num_images, capacity = len(model.images), len(observations)
-    offsets = np.zeros(num_images + 1, dtype=np.int64)
-    observation_row = np.empty(capacity, dtype=np.int64)
-    residuals = np.empty((2, capacity))
-    jacobian = np.empty((2, 3, capacity))
-    pose_offset = np.full(num_images, np.nan)
-    waiting = _PoseOffsets(pose_offset)
-    d_extra: list[FloatArray] = []
-    counts = np.zeros((4, num_images), dtype=np.int64)
+    kept = Kept(model)
+    waiting = _PoseOffsets(kept.pose_offset_px)
     rotations = rotation_from_quat(model.images.quat_cam_from_world_wxyz)
-    for image_idx in range(num_images):
-        image, linked = model.image(image_idx), slice(*observations.offsets[image_idx : image_idx + 2])
-        point_idx = observations.point_idx[linked]
-        part = image_residuals(image, observations.xy_px[linked], _points_of(model, point_idx), point_idx)
-        own = slice(offsets[image_idx], offsets[image_idx] + part.inlier_row.size)
-        offsets[image_idx + 1] = own.stop
-        np.add(part.inlier_row, linked.start, out=observation_row[own])
-        residuals[:, own] = part.residuals_px
-        jacobian[:, :, own] = rotations[image_idx].T @ part.jacobian_cam
+    for image_idx in kept.missing.tolist():
+        part = _part_of(model, image_idx)
+        kept.put(
+            image_idx, part.inlier_row, part.residuals_px, rotations[image_idx].T @ part.jacobian_cam, part.d_extra
+        )
+        kept.count(
+            image_idx,
+            dangling=part.num_dangling,
+            behind=part.num_behind,
+            nonfinite=part.num_nonfinite,
+            unprojected=part.num_unprojected,
+        )
         waiting.add(image_idx, part)
-        d_extra.append(part.d_extra)
-        counts[:, image_idx] = part.num_dangling, part.num_behind, part.num_nonfinite, part.num_unprojected
+    for image_idx in kept.unsure.tolist():
+        waiting.add(image_idx, _part_of(model, image_idx))
     waiting.flush()
-    total = offsets[-1]
-    observation_row = observation_row[:total]
-    inlier_point = observations.point_idx if total == capacity else observations.point_idx[observation_row]
+    offsets, pose_offset = kept.pack(), kept.pose_offset_px
+    all_in = len(kept.rows) == len(observations)
+    point_idx = observations.point_idx if all_in else observations.point_idx[kept.rows]
     if (frames := claimed_frames(model)) is not None:
-        pose_offset = frame_offsets_px(model, frames, offsets, inlier_point, (residuals, jacobian))
+        on_points = (kept.residuals_px, kept.point_jacobian)
+        pose_offset = frame_offsets_px(model, frames, offsets, point_idx, on_points)
     return ModelResiduals(
         offsets,
-        observation_row,
-        inlier_point,
-        residuals[:, :total],
-        jacobian[:, :, :total],
+        kept.rows,
+        point_idx,
+        kept.residuals_px,
+        kept.point_jacobian,
         pose_offset,
-        tuple(d_extra),
-        *counts,
+        kept.d_extra,
+        *kept.others,
     )
+
+
+def _part_of(model: SparseModel, image_idx: int) -> ImageResiduals:
+    """The inliers of the image in row ``image_idx``."""
+    observations = model.observations
+    linked = slice(*observations.offsets[image_idx : image_idx + 2])
+    point_idx = observations.point_idx[linked]
+    return image_residuals(model.image(image_idx), observations.xy_px[linked], _points_of(model, point_idx), point_idx)

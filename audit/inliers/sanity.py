@@ -50,5 +50,10 @@ def _median(values: FloatArray) -> float:
 
 def is_usable(camera: CameraRecord) -> bool:
     """Whether anything can be projected with a camera: parameters sane, no focal length of (nearly) 0."""
-    focals = camera.params[list(camera.model.focal_idxs)]
-    return bool(is_sane(camera.params).all() and (np.abs(focals) >= _MIN_FOCAL_PX).all())
+    params = camera.params[None]
+    return bool(are_usable(params, params[:, list(camera.model.focal_idxs)])[0])
+
+
+def are_usable(params: FloatArray, focals_px: FloatArray) -> BoolArray:
+    """Return the same (n,) of n cameras of one model: their parameters (n, p), and of these the focal lengths."""
+    return np.asarray(is_sane(params).all(axis=1) & (np.abs(focals_px) >= _MIN_FOCAL_PX).all(axis=1))

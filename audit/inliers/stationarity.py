@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _SMALLEST_PIVOT = 1e-10  # of the Gram matrix of unit columns; below it the orthonormal basis is taken by SVD
 
@@ -80,6 +80,37 @@ def offset_px(columns: FloatArray, residuals_px: FloatArray) -> float:
         basis, singular, _ = np.linalg.svd(columns[used].T / norms, full_matrices=False)
         projected = basis[:, singular > 1e-9 * singular[0]].T @ y
     return float(np.sqrt(projected @ projected / n))
+
+
+def offsets_of_sums(gram: FloatArray, right: FloatArray, num_points: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return `offset_px` (I,) of images of which only sums are known, and which of them are well above rounding.
+
+    Parameters
+    ----------
+    gram, right : (I, 6, 6) and (I, 6), products of the pose columns with each other and with the residuals
+    num_points : (I,) observations
+
+    Notes
+    -----
+    Cholesky's factor of the unit columns' Gram matrix, and what it leaves of the right-hand side, of all images at
+    once; an image whose matrix has none gets NaN and is not sure.
+    """
+    with np.errstate(all="ignore"):
+        norms = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+        factor = np.array((gram / norms[:, None, :] / norms[:, :, None]).transpose(1, 2, 0))  # images last
+        projected = np.array((right / norms).T)
+        smallest = np.full(len(gram), np.inf)
+        for column in range(len(projected)):
+            pivot = factor[column, column] - (factor[column, :column] ** 2).sum(axis=0)
+            smallest = np.minimum(smallest, pivot)
+            root = np.sqrt(pivot)
+            rest = factor[column + 1 :, column]
+            rest -= (factor[column + 1 :, :column] * factor[column, :column]).sum(axis=1)
+            rest /= root
+            factor[column, column] = root
+            projected[column] = (projected[column] - (factor[column, :column] * projected[:column]).sum(axis=0)) / root
+        offsets = np.sqrt((projected**2).sum(axis=0) / num_points)
+    return offsets, np.asarray((smallest > _SMALLEST_PIVOT) & np.isfinite(offsets))
 
 
 def pose_offsets_px(parts: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> list[float]:

@@ -11,8 +11,11 @@ from numpy.testing import assert_allclose
 
 from sfm_audit.audit.cameras import projection
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.inliers import kept
 from sfm_audit.audit.inliers.projected import image_inliers, project_image
 from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.kernels import numpy_only
+from sfm_audit.audit.kernels.projection import project_scene
 
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 GRID_POINTS = 256  # of the map of expected errors: rays of pixels, no observations
@@ -20,7 +23,7 @@ GRID_POINTS = 256  # of the map of expected errors: rays of pixels, no observati
 
 @pytest.fixture
 def projected(monkeypatch):
-    """Sizes of all that is projected from now on, measurement grids apart."""
+    """Sizes of all that is projected from now on, by numpy or by the kernel, measurement grids apart."""
     sizes = []
     plane = projection._plane
 
@@ -29,7 +32,13 @@ def projected(monkeypatch):
             sizes.append(len(xyz_cam))
         return plane(model, params, xyz_cam, want)
 
+    def counted_scene(scene):
+        found = project_scene(scene)
+        sizes.append(0 if found is None else len(scene.point_idx))
+        return found
+
     monkeypatch.setattr(projection, "_plane", counted)
+    monkeypatch.setattr(kept, "project_scene", counted_scene)
     return sizes
 
 
@@ -39,6 +48,10 @@ def test_an_audit_projects_each_observation_once(projected, shared):
     projected.clear()
     tables = ModelAuditor(model).tables(observations=True)
     assert tables.images["verdict"].to_pylist() == ["accepted"] * len(model.images)
+    assert sum(projected) == len(model.observations)
+    projected.clear()
+    with numpy_only():
+        ModelAuditor(model).tables(observations=True)
     assert sum(projected) == len(model.observations)
 
 

@@ -1,0 +1,228 @@
+"""The compiled projection of a whole model is that of numpy, image by image: every camera model, odd numbers, gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.special import hyp2f1
+
+from sfm_audit.audit.inliers import kept
+from sfm_audit.audit.inliers.residuals import image_residuals, model_residuals
+from sfm_audit.audit.inliers.stationarity import offset_px, offsets_of_sums
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.projection import LENSES, project_scene
+from sfm_audit.loaders.camera_models import BY_NAME, CAMERA_MODELS
+from sfm_audit.loaders.model import CameraTable, ImageTable, ObservationTable, PointTable, SparseModel
+
+pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here")
+NAMES = [model.name for model in CAMERA_MODELS]
+PARAMS = (
+    {"f": 900.0, "fx": 900.0, "fy": 950.0, "cx": 800.0, "cy": 600.0, "w": 1600.0, "h": 1200.0}
+    | {"k": -0.11, "k0": 0.08, "k1": -0.09, "k2": 0.03, "k3": -0.02, "k4": 0.014, "k5": 0.01, "k6": -0.006}
+    | {"p0": -0.006, "p1": 0.008, "p2": -0.005, "s0": 0.006, "s1": -0.008, "s2": 0.004, "s3": 0.009, "sx1": 0.007}
+    | {"sy1": -0.009, "omega": 0.8, "alpha": 0.6, "beta": 1.2, "transition": 0.6, "b1": 0.01, "b2": -0.02}
+)
+SIZES = (0, 1, 3, 40, 129, 300)
+
+
+def model_with(name, seed=0, sizes=SIZES, **changed):
+    """Images of one camera model with so many observations each, their points in front of all of them."""
+    rng = np.random.default_rng(seed)
+    camera, num_images, num = BY_NAME[name], len(sizes), sum(sizes)
+    params = np.array([{**PARAMS, **changed}[each] for each in camera.param_names])
+    quats = np.column_stack([np.ones(num_images), rng.normal(0.0, 0.05, (num_images, 3))])
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    quats[-1] *= 1.1  # COLMAP does not normalise either
+    depth = rng.uniform(2.0, 9.0, num + 1)
+    xyz = np.column_stack([rng.uniform(-0.6, 0.6, num + 1) * depth, rng.uniform(-0.5, 0.5, num + 1) * depth, depth])
+    xyz[:1] = 0.0, 0.0, 5.0  # on the axis of an image without rotation
+    quats[0], offsets = (1.0, 0.0, 0.0, 0.0), np.concatenate([[0], np.cumsum(sizes)])
+    cameras = CameraTable(
+        np.arange(num_images, dtype=np.uint32),
+        np.full(num_images, camera.model_id),
+        np.full(num_images, 1600),
+        np.full(num_images, 1200),
+        np.concatenate([params * (1.0 + 0.001 * i) for i in range(num_images)]),
+        np.arange(num_images + 1) * camera.num_params,
+    )
+    images = ImageTable(
+        np.arange(num_images, dtype=np.uint32),
+        tuple(f"{i}.jpg" for i in range(num_images)),
+        np.arange(num_images, dtype=np.uint32),
+        np.arange(num_images),
+        quats,
+        rng.normal(0.0, 0.1, (num_images, 3)) * np.array([[i > 0] for i in range(num_images)]),
+        np.array(sizes),
+    )
+    points = PointTable(np.arange(num + 1, dtype=np.uint64), xyz, np.full(num + 1, 1.0))
+    xy = rng.uniform(0.0, 1.0, (num, 2)) * (1600.0, 1200.0)
+    observations = ObservationTable(offsets, np.arange(num), xy, rng.permutation(num + 1)[:num])
+    return SparseModel("simulated", "binary", cameras, images, points, observations, ())
+
+
+def assert_same_on_both_paths(model):
+    """Return the residuals of the compiled path."""
+    found = model_residuals(model)
+    with numpy_only():
+        wanted = model_residuals(model)
+    for field in ("offsets", "observation_row", "point_idx", "num_dangling", "num_behind", "num_nonfinite"):
+        assert_array_equal(getattr(found, field), getattr(wanted, field), err_msg=field)
+    assert_array_equal(found.num_unprojected, wanted.num_unprojected)
+    assert_allclose(found.residuals_px, wanted.residuals_px, rtol=1e-11, atol=1e-11)
+    for image_idx, (ours, theirs) in enumerate(zip(found.d_extra, wanted.d_extra, strict=True)):
+        assert ours.shape == theirs.shape
+        assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max(initial=1.0))
+        rows = found.rows(image_idx)
+        scale = np.abs(wanted.point_jacobian[:, :, rows]).max(initial=0.0)
+        assert_allclose(
+            found.point_jacobian[:, :, rows], wanted.point_jacobian[:, :, rows], rtol=1e-9, atol=1e-9 * scale
+        )
+    assert_allclose(found.pose_offset_px, wanted.pose_offset_px, rtol=1e-9)
+    assert found.residuals_px.flags.c_contiguous
+    assert found.point_jacobian.flags.c_contiguous
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_camera_model(name):
+    model = model_with(name)
+    assert_same_on_both_paths(model)
+    done = project_scene(kept.scene_of(model)).done
+    assert_array_equal(done, name in LENSES)
+
+
+def test_all_perspective_and_fisheye_models_of_colmap_are_compiled():
+    spherical = {model.name for model in CAMERA_MODELS if model.is_spherical}
+    assert {model.name for model in CAMERA_MODELS if model.is_colmap} - spherical <= set(LENSES)
+
+
+@pytest.mark.parametrize("omega", [1e-3, 0.02, -0.8, 1.4])
+def test_each_branch_of_fov(omega):
+    assert_same_on_both_paths(model_with("FOV", omega=omega))
+
+
+@pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "DIVISION", "EUCM"])
+def test_observations_that_are_no_inliers_leave_no_gap(name):
+    model = model_with(name, sizes=(20, 300, 0, 140, 33))
+    xyz, point_idx, xy = (
+        model.points.xyz_world.copy(),
+        model.observations.point_idx.copy(),
+        model.observations.xy_px.copy(),
+    )
+    point_idx[[0, 21, 22, 200, 492]] = -1
+    xyz[point_idx[[3, 150, 400]]] *= -1.0  # behind
+    xyz[point_idx[[40, 401]]] = [[np.nan, 0.0, 1.0], [1e13, 0.0, 1.0]]
+    xy[[41, 402]] = [[np.inf, 0.0], [0.0, np.nan]]
+    model = replace(
+        model,
+        points=replace(model.points, xyz_world=xyz),
+        observations=replace(model.observations, point_idx=point_idx, xy_px=xy),
+    )
+    found = assert_same_on_both_paths(model)
+    assert found.num_dangling.sum() == 5
+    assert found.num_behind.sum() == 3
+    assert found.num_nonfinite.sum() == 4
+    assert project_scene(kept.scene_of(model)).done.all()
+
+
+@pytest.mark.parametrize(
+    ("z", "xy"), [(1e-17, 1.0), (1e-12, 1e-12), (1.0, 1e11), (1e12, 1e-3), (1e-9, 1e12), (5e-324, 0.0)]
+)
+@pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "FULL_OPENCV", "RAD_TAN_THIN_PRISM_FISHEYE", "DIVISION", "EUCM"])
+def test_extreme_points_are_numpy_s(name, z, xy):
+    model = model_with(name, sizes=(9, 9, 140))
+    xyz = model.points.xyz_world.copy()
+    images = replace(
+        model.images,
+        quat_cam_from_world_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
+        translation_cam_from_world=np.zeros((3, 3)),
+    )
+    xyz[model.observations.point_idx[[4, 20]]] = xy, -xy, z
+    assert_same_on_both_paths(replace(model, images=images, points=replace(model.points, xyz_world=xyz)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e100, -900.0])
+def test_odd_cameras_and_poses_are_numpy_s(value):
+    model = model_with("OPENCV", sizes=(30, 30, 30))
+    params, translation = model.cameras.params.copy(), model.images.translation_cam_from_world.copy()
+    params[0], translation[1, 0] = value, value
+    model = replace(
+        model,
+        cameras=replace(model.cameras, params=params),
+        images=replace(model.images, translation_cam_from_world=translation, camera_idx=np.array([0, 1, -1])),
+    )
+    assert_same_on_both_paths(model)
+
+
+def test_a_model_of_nothing():
+    model = model_with("PINHOLE", sizes=(0, 0))
+    assert_same_on_both_paths(model)
+    assert_same_on_both_paths(replace(model, points=PointTable(np.empty(0, np.uint64), np.empty((0, 3)), np.empty(0))))
+
+
+def test_a_pose_that_few_points_do_not_fix_is_asked_in_numpy():
+    model = model_with("RADIAL", sizes=(1, 2, 2, 50))
+    found = assert_same_on_both_paths(model)
+    assert np.isfinite(found.pose_offset_px).all()
+
+
+@pytest.mark.parametrize(
+    ("table", "field", "value"),
+    [
+        ("observations", "point_idx", 10**6),
+        ("images", "camera_idx", 7),
+        ("observations", "offsets", 10**6),
+        ("observations", "offsets", -1),
+    ],
+)
+def test_indices_that_point_outside_are_refused(table, field, value):
+    model = model_with("PINHOLE", sizes=(5, 5))
+    array = getattr(getattr(model, table), field).copy()
+    array[1] = value
+    scene = kept.scene_of(replace(model, **{table: replace(getattr(model, table), **{field: array})}))
+    with pytest.raises(IndexError):
+        project_scene(scene)
+
+
+def test_the_arctangent_of_the_kernel_is_that_of_a_series_of_gauss():
+    """theta of a fisheye camera: x = f theta; the outside number is r 2F1(1/2, 1; 3/2; -r^2)."""
+    tangent = np.concatenate([np.geomspace(1e-8, 1e8, 300), np.linspace(0.15, 8.0, 300)])
+    model = model_with("SIMPLE_FISHEYE", sizes=(len(tangent),), f=1.0, cx=0.0, cy=0.0)
+    xyz = np.column_stack([tangent, np.zeros_like(tangent), np.ones_like(tangent)])
+    xyz = np.concatenate([xyz, xyz[:1]])
+    observations = replace(model.observations, xy_px=np.zeros((len(tangent), 2)), point_idx=np.arange(len(tangent)))
+    images = replace(model.images, translation_cam_from_world=np.zeros((1, 3)))
+    images.quat_cam_from_world_wxyz[:] = 1.0, 0.0, 0.0, 0.0
+    scene = kept.scene_of(
+        replace(model, images=images, observations=observations, points=replace(model.points, xyz_world=xyz))
+    )
+    found = project_scene(scene)
+    theta = tangent * hyp2f1(0.5, 1.0, 1.5, -(tangent**2))
+    assert_allclose(-found.residuals_px[0], theta * scene.params[0, 0], rtol=1e-14)
+
+
+def test_offsets_of_sums_are_those_of_columns():
+    rng = np.random.default_rng(4)
+    columns, residuals = rng.normal(size=(5, 6, 2, 20)), rng.normal(size=(5, 2, 20))
+    columns[3, 1] = columns[3, 2] * (1.0 + 1e-9)  # not sure
+    columns[4, 5] = 0.0
+    flat = columns.reshape(5, 6, 40)
+    offsets, is_sure = offsets_of_sums(
+        flat @ flat.swapaxes(1, 2), np.einsum("icn,in->ic", flat, residuals.reshape(5, 40)), np.full(5, 20)
+    )
+    assert is_sure.tolist() == [True, True, True, False, False]
+    wanted = [offset_px(own, rest) for own, rest in zip(columns[:3], residuals[:3], strict=True)]
+    assert_allclose(offsets[:3], wanted, rtol=1e-12)
+
+
+def test_one_image_of_a_model_is_what_it_is_alone():
+    model = model_with("THIN_PRISM_FISHEYE")
+    found, linked = model_residuals(model), slice(*model.observations.offsets[4:6])
+    point_idx = model.observations.point_idx[linked]
+    part = image_residuals(
+        model.image(4), model.observations.xy_px[linked], model.points.xyz_world[point_idx], point_idx
+    )
+    assert_allclose(found.residuals_px[:, found.rows(4)], part.residuals_px, rtol=1e-11)
