@@ -70,7 +70,7 @@ def platform_flags() -> list[str]:
     """What the operating system needs: macOS to know for which of its versions, the others position independence."""
     if sys.platform == "darwin":
         return ["-fPIC", "-arch", platform.machine(), f"-mmacosx-version-min={OLDEST_MACOS}"]
-    return ["-static-libgcc"] if sys.platform == "win32" else ["-fPIC", "-s"]
+    return ["-static-libgcc"] if sys.platform == "win32" else ["-fPIC"]
 
 
 def build(library: Path = LIBRARY, extra: list[str] | None = None) -> str | None:
@@ -80,7 +80,8 @@ def build(library: Path = LIBRARY, extra: list[str] | None = None) -> str | None
         return NO_COMPILER
     partial = library.with_suffix(f".{os.getpid()}.partial")
     sources = [str(path) for path in sorted(SOURCES.glob("*.c"))]
-    flags = [*FLAGS, *platform_flags(), *WARNINGS, *(extra or []), f'-DSFM_SOURCES="{sources_hash()}"']
+    extra = ["-s"] if extra is None and sys.platform != "darwin" else extra or []  # -s: no names of static functions
+    flags = [*FLAGS, *platform_flags(), *WARNINGS, *extra, f'-DSFM_SOURCES="{sources_hash()}"']
     try:
         done = subprocess.run(
             [*command, *flags, "-o", str(partial), *sources, "-lm"],
