@@ -10,9 +10,10 @@ import numpy as np
 
 from sfm_audit.audit.calibrate.camera import CalibratedCamera, Distortion
 from sfm_audit.audit.calibrate.estimate import Estimate
-from sfm_audit.audit.camera_quality.expected_error import GRID, ExpectedErrorMap, cell_centres_px, measurement_error_px
+from sfm_audit.audit.camera_quality.expected_error import ExpectedErrorMap, measurement_error_px
 from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, Identifiability
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility, folds_over
+from sfm_audit.audit.camera_quality.shapes import GRID, cell_centres_px
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.correspondences.records import Correspondences

@@ -2,38 +2,89 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord
 
-_FEW = 12  # points that are not worth thinning out before the hull
+_Point: TypeAlias = tuple[float, ...]
+_FEW: Final = 12  # points that are not worth thinning out before the hull
+_DIRECTIONS: Final = np.array([[0, 1, 1, 2, 1, 2, 1, 1], [1, 2, 1, 1, 0, -1, -1, -2]], dtype=np.float64).T
+_FLAT: Final = 1e-13  # of the squared size: what is smaller is rounding of points on one line
+_MAX_CELLS: Final = 1 << 22  # in memory at the same time
+
+
+class Spread(NamedTuple):
+    """How far the inliers of B images spread: coverage (B,), occupied_cells (B,)."""
+
+    coverage: FloatArray
+    occupied_cells: IntArray
+
+
+def spread_of(xy_px: FloatArray, offsets: IntArray, cameras: Sequence[CameraRecord], grid: int) -> Spread:
+    """Return `coverage` and `occupied_cells` of B images.
+
+    Parameters
+    ----------
+    xy_px : (n, 2) observed, image after image; image b owns rows offsets[b]:offsets[b + 1]        offsets : (B + 1,)
+    """
+    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    hulls = [hull_area_px2(xy_px[first:last]) for first, last in pairwise(offsets.tolist())]
+    area = size[:, 0] * size[:, 1]
+    with np.errstate(all="ignore"):
+        covered = np.where(area > 0.0, hulls / area, np.nan)
+    return Spread(covered, cells_of(xy_px, offsets, size, grid))
 
 
 def hull_area_px2(xy_px: FloatArray) -> float:
-    """Area, px^2, of the convex hull of (n, 2) image points; 0 when they are fewer than three or on one line."""
-    outer = _outside_octagon(xy_px) if len(xy_px) > _FEW else xy_px
-    if len(outer) < 3:
+    """Area, px^2, of the convex hull of (n, 2) image points; 0 when they are fewer than three or on one line.
+
+    Notes
+    -----
+    Andrew's monotone chain over what lies outside of the polygon of the extreme points in 16 directions; the area is
+    that of the triangles from the leftmost point.
+    """
+    outer = _outside_polygon(xy_px) if len(xy_px) > _FEW else xy_px
+    points = sorted(map(tuple, outer.tolist()))
+    if len(points) < 3:
         return 0.0
-    try:
-        return float(ConvexHull(outer).volume)  # in the plane Qhull's "volume" is the area
-    except QhullError:  # collinear, to Qhull's precision
-        return 0.0
+    left, right = points[0], points[-1]
+    chains = _chain(points), _chain(points[::-1])
+    twice = sum(_turn(left, start, end) for chain in chains for start, end in pairwise(chain))
+    tall = max(y for _, y in points) - min(y for _, y in points)
+    wide = right[0] - left[0]
+    return 0.5 * twice if twice > _FLAT * (wide * wide + tall * tall) else 0.0
 
 
-def _outside_octagon(xy_px: FloatArray) -> FloatArray:
-    """Drop points strictly inside the octagon of the extreme points in eight directions: they are not on the hull."""
-    x, y = xy_px[:, 0], xy_px[:, 1]
-    directions = (y, x + y, x, x - y)
-    corners = {int(np.argmin(d)) for d in directions} | {int(np.argmax(d)) for d in directions}
-    polygon = _counter_clockwise(xy_px[sorted(corners)])
-    inside = np.ones(len(xy_px), dtype=bool)
-    for (start_x, start_y), (end_x, end_y) in pairwise([*polygon.tolist(), polygon[0].tolist()]):
-        along_x, along_y = end_x - start_x, end_y - start_y
-        inside &= along_x * y - along_y * x > along_x * start_y - along_y * start_x
-    return xy_px[~inside]
+def _chain(points: list[_Point]) -> list[_Point]:
+    """Return the hull from the first to the last of sorted points, which turns left everywhere."""
+    out: list[_Point] = []
+    for point in points:
+        while len(out) > 1 and _turn(out[-2], out[-1], point) <= 0.0:
+            out.pop()
+        out.append(point)
+    return out
+
+
+def _turn(a: _Point, b: _Point, c: _Point) -> float:
+    """Twice the area of a triangle, positive where c lies to the left of the way from a to b."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _outside_polygon(xy_px: FloatArray) -> FloatArray:
+    """Drop points strictly inside the polygon of the extreme points in some directions: they are not on the hull."""
+    along = _DIRECTIONS @ xy_px.T
+    corners = np.unique(np.concatenate([along.argmin(axis=1), along.argmax(axis=1)]))
+    polygon = _counter_clockwise(xy_px[corners])
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    normals = np.column_stack([-edges[:, 1], edges[:, 0]])
+    inside = (normals @ xy_px.T > (normals * polygon).sum(axis=1)[:, None]).all(axis=0)
+    inside[corners] = False  # whatever rounding says
+    return np.asarray(xy_px[~inside])
 
 
 def _counter_clockwise(corners: FloatArray) -> FloatArray:
@@ -49,9 +100,23 @@ def coverage(xy_px: FloatArray, width: int, height: int) -> float:
 
 def occupied_cells(xy_px: FloatArray, width: int, height: int, grid: int) -> int:
     """Number of cells with at least one inlier, of a grid x grid division of the image; outside points are in none."""
-    if width * height == 0 or not len(xy_px):
-        return 0
-    column, row = np.floor(xy_px[:, 0] * (grid / width)), np.floor(xy_px[:, 1] * (grid / height))
-    inside = (column >= 0) & (column < grid) & (row >= 0) & (row < grid)
-    index = (column * grid + row)[inside].astype(np.int64)
-    return int(np.count_nonzero(np.bincount(index, minlength=grid * grid)))
+    return int(cells_of(xy_px, np.array([0, len(xy_px)]), np.array([[width, height]], dtype=np.float64), grid)[0])
+
+
+def cells_of(xy_px: FloatArray, offsets: IntArray, size_px: FloatArray, grid: int) -> IntArray:
+    """Return `occupied_cells` of B images: points (n, 2), image after image, with offsets (B + 1,), sizes (B, 2)."""
+    out = np.zeros(len(size_px), dtype=np.int64)
+    step = max(1, _MAX_CELLS // (grid * grid))
+    for start in range(0, len(out), step):
+        own, sizes = offsets[start : start + step + 1], size_px[start : start + step]
+        xy = xy_px[own[0] : own[-1]].T
+        image = np.repeat(np.arange(len(sizes)), np.diff(own))
+        with np.errstate(all="ignore"):
+            per_px = np.where(np.all(sizes > 0, axis=1, keepdims=True), grid / sizes, np.nan).T
+            column, row = (np.floor(along * own_per_px[image]) for along, own_per_px in zip(xy, per_px, strict=True))
+        inside = np.flatnonzero((column >= 0) & (column < grid) & (row >= 0) & (row < grid))
+        place = (image[inside] * grid + column[inside].astype(np.int64)) * grid + row[inside].astype(np.int64)
+        hit = np.zeros(len(sizes) * grid * grid, dtype=np.bool_)
+        hit[place] = True
+        out[start : start + step] = np.count_nonzero(hit.reshape(len(sizes), -1), axis=1)
+    return out

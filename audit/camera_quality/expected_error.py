@@ -12,14 +12,12 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, ParameterCovariance, fitted_names
-from sfm_audit.audit.cameras import unproject
+from sfm_audit.audit.camera_quality.shapes import GRID, cell_centres_px, columns_of_grids, rays_of_grids
 from sfm_audit.audit.cameras.columns import EPSILON
-from sfm_audit.audit.inliers.projected import project_image
-from sfm_audit.audit.misfit.nuisance import nuisance_columns
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
-GRID: Final = 16
 _TRANSLATION: Final = frozenset(POSE_NAMES[3:])
 
 
@@ -41,19 +39,12 @@ class ExpectedErrorMap:
         return float(np.median(finite)) if finite.size else math.nan
 
 
-def cell_centres_px(width: int, height: int, grid: int = GRID) -> FloatArray:
-    """Return (grid, grid, 2) px: centres of grid x grid equal cells of the image."""
-    share = (np.arange(grid) + 0.5) / grid
-    return np.stack(np.meshgrid(share * width, share * height), axis=-1)
-
-
 def grid_rays(camera: CameraRecord, grid: int = GRID) -> FloatArray:
     """Return (grid * grid, 3) unit rays, camera frame, of the `cell_centres_px`; NaN where there is none.
 
     They depend on the camera alone: compute them once where images share a camera.
     """
-    pixels = cell_centres_px(camera.width, camera.height, grid).reshape(-1, 2)
-    return unproject(camera.model, camera.params, pixels)
+    return np.asarray(rays_of_grids([camera], grid)[0])
 
 
 def grid_columns(camera: CameraRecord, grid: int = GRID, *, rays: FloatArray | None = None) -> FloatArray:
@@ -66,12 +57,7 @@ def grid_columns(camera: CameraRecord, grid: int = GRID, *, rays: FloatArray | N
     rays : `grid_rays` of this camera and grid, where they are at hand
     """
     rays = grid_rays(camera, grid) if rays is None else rays
-    with np.errstate(invalid="ignore", over="ignore"):
-        return nuisance_columns(camera.model, project_image(camera, _at_depth(camera, rays, 1.0)))
-
-
-def _at_depth(camera: CameraRecord, rays: FloatArray, depth: float) -> FloatArray:
-    return rays * depth if camera.model.is_spherical else rays * (depth / rays[:, 2:])
+    return np.asarray(columns_of_grids([camera], rays[None])[0])
 
 
 def median_depth(camera: CameraRecord, xyz_cam: FloatArray) -> float:
@@ -132,16 +118,48 @@ def expected_error_px(
 ) -> float:
     """Return the median of the map alone; arguments as of `expected_error_map`."""
     seen = _seen_from_one(camera, parameters, depth)
-    error = measurement_error_px(columns, fitted_names(camera.model), seen, sigma_px)
-    error.sort()  # NaN last
-    num = int(np.searchsorted(error, np.inf))
-    return 0.5 * float(error[(num - 1) // 2] + error[num // 2]) if num else math.nan
+    return float(_medians(measurement_error_px(columns, fitted_names(camera.model), seen, sigma_px)[None])[0])
+
+
+def stack_errors_px(
+    model: CameraModel, columns: FloatArray, covariance: FloatArray, sigma_px: FloatArray, depth: FloatArray
+) -> FloatArray:
+    """Return `expected_error_px` of B images whose cameras have one model, (B,).
+
+    Parameters
+    ----------
+    columns : (B, q, 2, n) `grid_columns` of each image's camera, (1, q, 2, n) where they share one
+    covariance : (B, q, q) of all parameters in `fitted_names`        sigma_px, depth : (B,) as of `expected_error_map`
+    """
+    moves = np.isin(fitted_names(model), list(_TRANSLATION))
+    unit = np.where(moves, _inverse_depth(model, depth)[:, None], 1.0)
+    seen = covariance * unit[:, None] * unit[:, :, None]
+    by_pixel = columns.reshape(*columns.shape[:2], -1)
+    product = seen @ by_pixel
+    product *= by_pixel
+    variance = product.sum(axis=1).reshape(len(seen), 2, -1).sum(axis=1)
+    return _medians(np.sqrt(variance + 2.0 * sigma_px[:, None] ** 2))
+
+
+def _medians(error: FloatArray) -> FloatArray:
+    """Medians (B,) of the finite ones of (B, n), n > 0; NaN without any."""
+    error = np.sort(error, axis=1)  # NaN last
+    num = np.count_nonzero(error < np.inf, axis=1)
+    row = np.arange(len(error))
+    middle = 0.5 * (error[row, np.maximum(num - 1, 0) // 2] + error[row, np.minimum(num // 2, error.shape[1] - 1)])
+    return np.where(num > 0, middle, np.nan)
+
+
+def _inverse_depth(model: CameraModel, depth: FloatArray) -> FloatArray:
+    """1 / depth; NaN where nothing projects from there."""
+    nearest = 0.0 if model.is_spherical else EPSILON
+    with np.errstate(divide="ignore"):
+        return np.where((nearest <= depth) & (depth < np.inf) & (depth != 0.0), 1.0 / depth, np.nan)
 
 
 def _seen_from_one(camera: CameraRecord, parameters: ParameterCovariance, depth: float) -> ParameterCovariance:
     """Return the covariance in the unit of length that makes ``depth`` 1; NaN where nothing projects from there."""
-    nearest = 0.0 if camera.model.is_spherical else EPSILON
-    inverse = 1.0 / depth if nearest <= depth < math.inf and depth else math.nan
+    inverse = float(_inverse_depth(camera.model, np.array([depth]))[0])
     unit = np.array([inverse if name in _TRANSLATION else 1.0 for name in parameters.names])
     return replace(parameters, covariance=parameters.covariance * unit * unit[:, None])
 
@@ -165,5 +183,7 @@ def measurement_error_px(
     if len(parameters.names) < len(names):
         columns = columns[[names.index(name) for name in parameters.names]]
     by_pixel = columns.reshape(len(columns), -1)
-    variance = np.einsum("cm,cm->m", parameters.covariance @ by_pixel, by_pixel).reshape(2, -1).sum(axis=0)
+    product = parameters.covariance @ by_pixel
+    product *= by_pixel
+    variance = product.sum(axis=0).reshape(2, -1).sum(axis=0)
     return np.asarray(np.sqrt(variance + 2.0 * sigma_px**2))

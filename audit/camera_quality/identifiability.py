@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from functools import cache, lru_cache, partial
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfm_audit.audit.misfit.in_parts import ColumnSums
 from sfm_audit.audit.table.thresholds import SINGULAR_SHARE
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
@@ -23,6 +24,7 @@ POSE_NAMES: Final = ("rotation_x", "rotation_y", "rotation_z", "translation_x", 
 _SMALLEST_PIVOT: Final = 1e-10  # of the Gram matrix of unit columns: below it the singular values are taken exactly
 
 
+@cache
 def fitted_names(model: CameraModel) -> tuple[str, ...]:
     """Names of the columns of method.md section 5's N: the pose, then all intrinsics but the principal point.
 
@@ -89,40 +91,62 @@ def parameter_covariance(columns: FloatArray, names: tuple[str, ...], sigma_px: 
     Derivatives that are not finite, or no observations, leave everything NaN.
     """
     flat = columns.reshape(len(columns), -1)
+    if len(names) != len(flat):
+        raise ValueError(f"{len(flat)} columns but {len(names)} names")
     with np.errstate(over="ignore", invalid="ignore"):
-        norms = np.sqrt(np.einsum("cm,cm->c", flat, flat))
+        gram = flat @ flat.T
+    sigma, num_values = np.array([sigma_px]), np.array([flat.shape[1]])
+    return covariances_of_grams(gram[None], names, sigma, num_values, lambda _, norms: unit_triangle(flat, norms))[0]
+
+
+def unit_triangle(columns: FloatArray, norms: FloatArray) -> FloatArray:
+    """Return R of a QR of columns (q, m), those that are not zero, scaled to unit length."""
     used = np.flatnonzero(norms != 0.0)
-    if not used.size or not np.isfinite(norms).all():
-        return covariance_of_sums(names, ColumnSums(norms, np.zeros((0, 0)), flat.shape[1]), sigma_px, lambda: flat)
-    unit = (flat if used.size == len(flat) else flat[used]) / norms[used, None]
-    sums = ColumnSums(norms, unit @ unit.T, flat.shape[1])
-    return covariance_of_sums(names, sums, sigma_px, lambda: np.asarray(np.linalg.qr(unit.T, mode="r")))
+    return np.asarray(np.linalg.qr((columns[used] / norms[used, None]).T, mode="r"))
 
 
-def parameter_covariances(
-    columns: FloatArray, names: tuple[str, ...], sigma_px: FloatArray
+def covariances_of_grams(
+    grams: FloatArray,
+    names: tuple[str, ...],
+    sigma_px: FloatArray,
+    num_values: IntArray,
+    triangle_of: Callable[[int, FloatArray], FloatArray],
 ) -> list[ParameterCovariance]:
-    """Return `parameter_covariance` of each of B images: columns (B, q, m), sigma_px (B,).
+    """Return `parameter_covariance` of each of B images from the Gram matrices (B, q, q) of their columns.
 
-    Images with zero columns, or whose Gram matrix leaves doubts, are left to it; the others are solved together.
+    Parameters
+    ----------
+    sigma_px : (B,) noise per axis        num_values : (B,) of every column
+    triangle_of : gives `unit_triangle` of the b-th image's columns, given their lengths (q,); asked where the Gram
+        matrix leaves doubts
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        norms = np.sqrt(np.einsum("bcm,bcm->bc", columns, columns))
-        usual = (np.isfinite(norms) & (norms != 0.0)).all(axis=1) & (columns.shape[1] <= columns.shape[2])
+        norms = np.sqrt(np.einsum("bcc->bc", grams))
+        usual = (np.isfinite(norms) & (norms != 0.0)).all(axis=1) & (len(names) <= num_values)
         chosen = np.flatnonzero(usual)
-        unit = columns[chosen] / norms[chosen, :, None]
-        values, vectors = np.linalg.eigh(unit @ unit.swapaxes(1, 2))
+        own = norms[chosen]
+        values, vectors = np.linalg.eigh(grams[chosen] / own[:, :, None] / own[:, None])
         share = np.sqrt(np.maximum(values[:, 0] / values[:, -1], 0.0))
         sure = (values[:, 0] > _SMALLEST_PIVOT * values[:, -1]) & (share > SINGULAR_SHARE)
-        root = vectors / np.sqrt(values)[:, None] * (sigma_px[chosen, None] / norms[chosen])[:, :, None]
+        root = vectors / np.sqrt(values)[:, None] * (sigma_px[chosen, None] / own)[:, :, None]
         covariance = root @ root.swapaxes(1, 2)
     solved = {b: k for k, b in enumerate(chosen.tolist()) if sure[k]}
-    return [
-        ParameterCovariance(names, covariance[solved[b]], float(share[solved[b]]))
-        if b in solved
-        else parameter_covariance(columns[b], names, float(sigma_px[b]))
-        for b in range(len(columns))
-    ]
+    shares = share.tolist()
+    out = []
+    for b, gram in enumerate(grams):
+        if b in solved:
+            out.append(ParameterCovariance(names, covariance[solved[b]], shares[solved[b]]))
+        else:
+            sums = _unit_sums(gram, norms[b], int(num_values[b]))
+            out.append(covariance_of_sums(names, sums, float(sigma_px[b]), partial(triangle_of, b, norms[b])))
+    return out
+
+
+def _unit_sums(gram: FloatArray, norms: FloatArray, num_values: int) -> ColumnSums:
+    """Leave out columns that are zero, scale the others to unit length."""
+    used = np.flatnonzero(norms != 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return ColumnSums(norms, gram[np.ix_(used, used)] / norms[used] / norms[used, None], num_values)
 
 
 def covariance_of_sums(
@@ -208,16 +232,35 @@ def identifiability(camera: CameraRecord, columns: FloatArray, sigma_px: float) 
 
 def identifiability_of(camera: CameraRecord, parameters: ParameterCovariance) -> Identifiability:
     """Return the same from the covariance of the parameters of `fitted_names`."""
-    model, params = camera.model, camera.params
-    focals = [(parameters.sd_of(model.param_names[i]), float(params[i])) for i in model.focal_idxs]
-    relative = [sd / abs(focal) if focal else math.nan for sd, focal in focals]
-    extra = model.extra_idxs
+    sd = np.sqrt(parameters.covariance.diagonal()).tolist()
+    places, params = _places_of(camera.model, parameters.names), camera.params
+    of_focals = [math.nan if k is None else sd[k] for k in places.focals]
+    focals = [float(params[i]) for i in camera.model.focal_idxs]
+    relative = [own / abs(focal) if focal else math.nan for own, focal in zip(of_focals, focals, strict=True)]
+    extra = camera.model.extra_idxs
     return Identifiability(
         parameters,
-        focals[0][0] if focals else math.nan,
-        float(np.max(relative)) if relative else math.nan,
-        parameters.sd_of(model.param_names[extra[0]]) if extra else math.nan,
+        of_focals[0] if focals else math.nan,
+        math.nan if not relative or any(map(math.isnan, relative)) else max(relative),
+        math.nan if places.k1 is None else sd[places.k1],
         float(params[extra[0]]) if extra else math.nan,
         has_focal=bool(focals),
         has_k1=bool(extra),
     )
+
+
+class _Places(NamedTuple):
+    """Where focal lengths and the first distortion parameter are among fitted parameters; None where they are not."""
+
+    focals: tuple[int | None, ...]
+    k1: int | None
+
+
+@lru_cache(maxsize=256)
+def _places_of(model: CameraModel, names: tuple[str, ...]) -> _Places:
+    def place(idx: int) -> int | None:
+        name = model.param_names[idx]
+        return names.index(name) if name in names else None
+
+    extra = model.extra_idxs
+    return _Places(tuple(map(place, model.focal_idxs)), place(extra[0]) if extra else None)

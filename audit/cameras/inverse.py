@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 
@@ -54,6 +54,7 @@ def undistort(
     if warp is radial:
         return _undistort_radially(extra, x, y)
     u, v = np.zeros_like(x), np.zeros_like(y)
+    moving = np.ones(x.shape, dtype=np.bool_)  # each point stops by itself: others do not matter to it
     for _ in range(MAX_ITERATIONS):
         at = warp(u, v, extra, Want.D_POINT)
         determinant = at.xu * at.yv - at.xv * at.yu
@@ -62,8 +63,9 @@ def undistort(
         radius, length = np.hypot(u, v), np.hypot(du, dv)
         reach = STEP * np.maximum(radius, 1.0)
         shorten = reach / np.maximum(reach, length)
-        u, v = u - shorten * du, v - shorten * dv
-        if not (length > CONVERGED * (1.0 + radius)).any():
+        u, v = np.where(moving, u - shorten * du, u), np.where(moving, v - shorten * dv, v)
+        moving &= length > CONVERGED * (1.0 + radius)
+        if not moving.any():
             break
     at = warp(u, v, extra, Want.VALUE)
     found = np.hypot(at.x - x, at.y - y) <= TOLERANCE * (1.0 + np.hypot(x, y))
@@ -75,14 +77,16 @@ def _undistort_radially(extra: Sequence[float], x: FloatArray, y: FloatArray) ->
     """Do what `undistort` does for the warp ``radial``, whose steps all point along the radius."""
     goal = np.hypot(x, y)
     radius = np.zeros_like(goal)
+    moving = np.ones(goal.shape, dtype=np.bool_)
     for _ in range(MAX_ITERATIONS):
         r2 = radius * radius
         gain, slope = radial_gain(r2, extra)
         step = (radius * gain - goal) / (gain + (2.0 * slope) * r2)
         size, length = np.abs(radius), np.abs(step)
         reach = STEP * np.maximum(size, 1.0)
-        radius = radius - step * (reach / np.maximum(reach, length))
-        if not (length > CONVERGED * (1.0 + size)).any():
+        radius = np.where(moving, radius - step * (reach / np.maximum(reach, length)), radius)
+        moving &= length > CONVERGED * (1.0 + size)
+        if not moving.any():
             break
     gain, _ = radial_gain(radius * radius, extra)
     found = np.abs(radius * gain - goal) <= TOLERANCE * (1.0 + goal)
@@ -96,7 +100,8 @@ def _undistort_radially(extra: Sequence[float], x: FloatArray, y: FloatArray) ->
 def _folded_on_the_way(warp: WarpFunction, extra: Sequence[float], u: FloatArray, v: FloatArray) -> BoolArray:
     """Whether the distortion turns over somewhere on the segment from the axis to (u, v), (n,)."""
     on_the_way = np.multiply.outer(FRACTIONS, np.stack([u, v]))
-    at = warp(on_the_way[:, 0].ravel(), on_the_way[:, 1].ravel(), extra, Want.D_POINT)
+    own = [np.tile(each, len(FRACTIONS)) if np.ndim(each) else each for each in extra]
+    at = warp(on_the_way[:, 0].ravel(), on_the_way[:, 1].ravel(), cast("Sequence[float]", own), Want.D_POINT)
     determinant = np.asarray(at.xu * at.yv - at.xv * at.yu, dtype=np.float64)
     smallest: FloatArray = determinant.reshape(len(FRACTIONS), -1).min(axis=0)
     return ~(smallest > 0.0)

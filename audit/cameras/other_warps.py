@@ -123,9 +123,11 @@ def _inverse_gain(a: FloatArray) -> FloatArray:
     root, and for a < 0 from 1 as well, where the cubic is concave and below 0.
     """
     gain = np.where(a >= -4.0 / 27.0, 1.0, np.nan)
+    moving = np.ones(a.shape, dtype=np.bool_)
     for _ in range(_NEWTON_STEPS):
         step = (a * gain * gain * gain + gain - 1.0) / (3.0 * a * gain * gain + 1.0)
-        gain = gain - step
-        if not (np.abs(step) > 1e-15 * gain).any():
+        gain = np.where(moving, gain - step, gain)
+        moving &= np.abs(step) > 1e-15 * gain
+        if not moving.any():
             break
     return gain

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
-from sfm_audit.audit.cameras.columns import Plane, Want, in_front
+from sfm_audit.audit.cameras.columns import Column, Plane, Want, in_front
 from sfm_audit.audit.cameras.fisheye import angle_gain
 from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.loaders.arrays import FloatArray, IntArray
@@ -97,7 +99,10 @@ def project_with_jacobians(
 def project_columns(
     model: CameraModel, params: FloatArray, xyz_cam: FloatArray, *, with_params: bool = True
 ) -> ProjectionColumns:
-    """Do what ``project_with_jacobians`` does, points last: for those who go on with one number of all points."""
+    """Do what ``project_with_jacobians`` does, points last: for those who go on with one number of all points.
+
+    ``params`` may be (p, n), where every point has a camera of its own; not for FOV, which asks what omega is.
+    """
     with np.errstate(all="ignore"):
         plane = _plane(model, params, xyz_cam, Want.D_EXTRA if with_params else Want.D_POINT)
         xy_px, lost = _finite_px(model, params, plane)
@@ -161,23 +166,40 @@ def extra_params(model: CameraModel, params: FloatArray) -> list[float]:
 
 
 def check_shapes(model: CameraModel, params: FloatArray, rows: FloatArray, width: int) -> None:
-    """Raise ValueError unless ``params`` fits ``model`` and ``rows`` is (n, width)."""
-    if params.shape != (model.num_params,):
+    """Raise ValueError unless ``params``, (p,) or (p, n), fits ``model`` and ``rows`` is (n, width)."""
+    if params.shape not in {(model.num_params,), (model.num_params, len(rows))}:
         raise ValueError(f"{model.name} has {model.num_params} parameters, got an array of shape {params.shape}")
     if rows.ndim != 2 or rows.shape[1] != width:
         raise ValueError(f"expected points of shape (n, {width}), got {rows.shape}")
+
+
+def scales_and_shifts(model: CameraModel, params: FloatArray) -> tuple[Column, Column, Column, Column]:
+    """Return `scale_and_shift` of (p,) parameters, and (n,) each of (p, n), where every point has its own."""
+    if params.ndim == 1:
+        return scale_and_shift(model, params)
+    if model.is_spherical:
+        return params[0], params[1], 0.0, 0.0
+    focals, centre = model.focal_idxs, model.principal_point_idxs
+    return params[focals[0]], params[focals[-1]], params[centre[0]], params[centre[1]]
+
+
+def extras(model: CameraModel, params: FloatArray) -> Sequence[float]:
+    """Return `extra_params` of (p,) parameters, and (n,) each of (p, n): to the distortions both are numbers."""
+    if params.ndim == 1:
+        return extra_params(model, params)
+    return cast("Sequence[float]", [params[i] for i in model.extra_idxs])
 
 
 def _plane(model: CameraModel, params: FloatArray, xyz_cam: FloatArray, want: Want) -> Plane:
     """Return the points on the model's distorted normalised plane; spherical models: as shares of the image."""
     check_shapes(model, params, xyz_cam, 3)
     x, y, z = xyz_cam[:, 0], xyz_cam[:, 1], xyz_cam[:, 2]
-    return functions_of(model).plane(x, y, z, extra_params(model, params), want)
+    return functions_of(model).plane(x, y, z, extras(model, params), want)
 
 
 def _finite_px(model: CameraModel, params: FloatArray, plane: Plane) -> tuple[FloatArray, IntArray | None]:
     """Return (2, n) px, NaN where not finite, and the points where it is not (None when there is none)."""
-    fx, fy, cx, cy = scale_and_shift(model, params)
+    fx, fy, cx, cy = scales_and_shifts(model, params)
     xy_px = np.empty((2, len(plane.x)))
     np.add(plane.x * fx, cx, out=xy_px[0])
     np.add(plane.y * fy, cy, out=xy_px[1])
@@ -190,7 +212,7 @@ def _finite_px(model: CameraModel, params: FloatArray, plane: Plane) -> tuple[Fl
 
 def _d_cam(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
     """Return (2, 3, n) d px / d point."""
-    fx, fy, _, _ = scale_and_shift(model, params)
+    fx, fy, _, _ = scales_and_shifts(model, params)
     d_cam = np.empty((2, 3, len(plane.x)))
     for axis in range(3):
         np.multiply(plane.d_cam[axis], fx, out=d_cam[0, axis])
@@ -200,7 +222,7 @@ def _d_cam(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
 
 def _d_params(model: CameraModel, params: FloatArray, plane: Plane) -> FloatArray:
     """Return (p, 2, n) d px / d params."""
-    fx, fy, _, _ = scale_and_shift(model, params)
+    fx, fy, _, _ = scales_and_shifts(model, params)
     d_params = np.zeros((model.num_params, 2, len(plane.x)))
     focals = (0, 1) if model.is_spherical else model.focal_idxs
     d_params[focals[0], 0] = plane.x

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm_audit.audit.cameras.models import functions_of
-from sfm_audit.audit.cameras.projection import check_shapes, extra_params, scale_and_shift
+from sfm_audit.audit.cameras.projection import check_shapes, extras, scales_and_shifts
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 
@@ -16,7 +16,7 @@ def unproject(model: CameraModel, params: FloatArray, xy_px: FloatArray) -> Floa
     Parameters
     ----------
     model : CameraModel
-    params : (p,)     in COLMAP's order, px and dimensionless
+    params : (p,)     in COLMAP's order, px and dimensionless; (p, n) where pixels have their own, not of FOV
     xy_px : (n, 2)    px in the distorted image
 
     Returns
@@ -38,7 +38,7 @@ def unproject(model: CameraModel, params: FloatArray, xy_px: FloatArray) -> Floa
     axis' side of every fold. pycolmap's ``cam_from_img`` starts at the distorted point and may answer from beyond.
     """
     check_shapes(model, params, xy_px, 2)
-    fx, fy, cx, cy = scale_and_shift(model, params)
+    fx, fy, cx, cy = scales_and_shifts(model, params)
     with np.errstate(all="ignore"):
         x, y = (xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy
-        return functions_of(model).rays(x, y, extra_params(model, params))
+        return functions_of(model).rays(x, y, extras(model, params))

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
-from sfm_audit.audit.camera_quality.joined import qualities_of_joined
+import numpy as np
+
+from sfm_audit.audit.camera_quality.coverage import Spread, spread_of
+from sfm_audit.audit.camera_quality.joined import sums_of_joined
 from sfm_audit.audit.camera_quality.measure import (
     CameraQuality,
     CameraShape,
-    camera_quality,
-    camera_quality_in_parts,
+    PointSums,
+    image_sums,
+    image_sums_in_parts,
+    qualities_of,
 )
 from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.misfit import MisfitTests
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 _MAX_POINTS_AT_ONCE: Final = 4096
+_POINTS_IN_A_TURN: Final = 1 << 16
 
 
 def quality_of_images(
@@ -36,46 +43,72 @@ def quality_of_images(
     -----
     What depends on a camera alone is computed once for all of these images.
     """
-    shapes: dict[int, CameraShape | None] = {}
-    out: list[CameraQuality | None] = []
-    alike: dict[tuple[int, int], list[int]] = {}
     images = list(image_idxs)
-    for place, image_idx in enumerate(images):
-        out.append(None)
-        rows = residuals.rows(image_idx)
-        if rows.start == rows.stop:
-            continue
-        camera_idx = int(model.images.camera_idx[image_idx])
-        if camera_idx not in shapes:
-            shapes[camera_idx] = CameraShape.of(model.camera(camera_idx))
-        shape = shapes[camera_idx]
-        if shape is None:
-            continue
-        num_inliers = rows.stop - rows.start
-        if num_inliers <= MAX_JOINED:
-            alike.setdefault((camera_idx, num_inliers), []).append(place)
-        else:
-            out[place] = _quality_of(shape, model, residuals, image_idx, float(sigma_px[image_idx]), grid=grid)
-    for (camera_idx, num_inliers), places in alike.items():
-        shape = shapes[camera_idx]
-        if shape is None:
-            continue
-        step = _MAX_POINTS_AT_ONCE // num_inliers
-        for part in (places[start : start + step] for start in range(0, len(places), step)):
-            own = [images[place] for place in part]
-            joined = joined_inliers(model, residuals, own, num_inliers)
-            for place, quality in zip(part, qualities_of_joined(shape, joined, sigma_px[own], grid=grid), strict=True):
-                out[place] = quality
+    out: list[CameraQuality | None] = [None] * len(images)
+    shapes = _shapes_of(model, images)
+    by_image = [shapes.get(int(model.images.camera_idx[image_idx])) for image_idx in images]
+    num_inliers = np.diff(residuals.offsets)[images]
+    asked = [place for place, shape in enumerate(by_image) if num_inliers[place] and shape is not None]
+    for places in _in_turns(asked, num_inliers):
+        own, of_images = [images[place] for place in places], [shape for place in places if (shape := by_image[place])]
+        misfits, sums = _sums_of(of_images, model, residuals, own)
+        seen = _spread_of(of_images, model, residuals, own, grid)
+        for place, quality in zip(places, qualities_of(of_images, misfits, sums, seen, sigma_px[own]), strict=True):
+            out[place] = quality
     return out
 
 
-def _quality_of(
-    shape: CameraShape, model: SparseModel, residuals: ModelResiduals, image_idx: int, sigma_px: float, *, grid: int
-) -> CameraQuality | None:
-    """What an image with many inliers says."""
-    rows = residuals.rows(image_idx)
-    if rows.stop - rows.start <= AT_ONCE:
-        return camera_quality(shape, image_inliers(model, residuals, image_idx), sigma_px, grid=grid)
-    xy_px = model.observations.xy_px.take(residuals.observation_row[rows], axis=0)
-    part = partial(image_inliers, model, residuals, image_idx)
-    return camera_quality_in_parts(shape, part, xy_px, sigma_px, grid=grid)
+def _in_turns(places: Sequence[int], num_inliers: IntArray) -> Iterator[list[int]]:
+    """Yield places of images whose columns are in memory together."""
+    turn, num_points = [], 0
+    for place in places:
+        turn.append(place)
+        num_points += int(num_inliers[place])
+        if num_points >= _POINTS_IN_A_TURN:
+            yield turn
+            turn, num_points = [], 0
+    if turn:
+        yield turn
+
+
+def _shapes_of(model: SparseModel, image_idxs: Sequence[int]) -> dict[int, CameraShape | None]:
+    """By row of the camera table, of the cameras of some images."""
+    used = np.unique(model.images.camera_idx[np.array(image_idxs, dtype=np.int64)])
+    rows = used[(used >= 0) & (used < len(model.cameras))].tolist()
+    return dict(zip(rows, CameraShape.of_all([model.camera(row) for row in rows]), strict=True))
+
+
+def _sums_of(
+    shapes: Sequence[CameraShape], model: SparseModel, residuals: ModelResiduals, image_idxs: Sequence[int]
+) -> tuple[list[MisfitTests], list[PointSums]]:
+    """What the inliers of images, with their cameras' shapes, add up to; of small images together."""
+    alike: dict[tuple[int, int], list[int]] = {}
+    out: dict[int, tuple[MisfitTests, PointSums]] = {}
+    for place, (shape, image_idx) in enumerate(zip(shapes, image_idxs, strict=True)):
+        rows = residuals.rows(image_idx)
+        num_inliers = rows.stop - rows.start
+        if num_inliers <= MAX_JOINED:
+            alike.setdefault((int(model.images.camera_idx[image_idx]), num_inliers), []).append(place)
+        elif num_inliers <= AT_ONCE:
+            out[place] = image_sums(shape.camera, image_inliers(model, residuals, image_idx))
+        else:
+            xy_px = model.observations.xy_px.take(residuals.observation_row[rows], axis=0)
+            out[place] = image_sums_in_parts(shape.camera, partial(image_inliers, model, residuals, image_idx), xy_px)
+    for (_, num_inliers), places in alike.items():
+        step = _MAX_POINTS_AT_ONCE // num_inliers
+        for part in (places[start : start + step] for start in range(0, len(places), step)):
+            joined = joined_inliers(model, residuals, [image_idxs[place] for place in part], num_inliers)
+            out.update(zip(part, sums_of_joined(shapes[part[0]].camera, joined, len(part)), strict=True))
+    return [out[place][0] for place in range(len(out))], [out[place][1] for place in range(len(out))]
+
+
+def _spread_of(
+    shapes: Sequence[CameraShape], model: SparseModel, residuals: ModelResiduals, image_idxs: Sequence[int], grid: int
+) -> Spread:
+    """How far the inliers of images spread."""
+    own = np.array(image_idxs, dtype=np.int64)
+    first, last = residuals.offsets[own], residuals.offsets[own + 1]
+    offsets: IntArray = np.concatenate([[0], np.cumsum(last - first)])
+    columns = np.repeat(first - offsets[:-1], last - first) + np.arange(offsets[-1])
+    xy_px = model.observations.xy_px.take(residuals.observation_row[columns], axis=0)
+    return spread_of(xy_px, offsets, [shape.camera for shape in shapes], grid)

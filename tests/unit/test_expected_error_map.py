@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.camera_quality.expected_error import (
-    cell_centres_px,
     expected_error_map,
     expected_error_px,
     grid_columns,
@@ -20,6 +19,7 @@ from sfm_audit.audit.camera_quality.expected_error import (
     median_depth,
 )
 from sfm_audit.audit.camera_quality.identifiability import fitted_names, parameter_covariance
+from sfm_audit.audit.camera_quality.shapes import cell_centres_px
 from sfm_audit.audit.cameras import project
 from sfm_audit.audit.inliers.projected import project_image
 from sfm_audit.audit.misfit.nuisance import nuisance_columns

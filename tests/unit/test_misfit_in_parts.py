@@ -132,7 +132,7 @@ def test_a_model_of_large_images_gets_the_same_tables(tmp_path, monkeypatch, con
     model = open_model(write_binary(tmp_path, noisy_model(num_images=4, num_points=90)))
     expected = audit_model(model, config)
     asked = []
-    for module, name in ((engine_camera, "camera_tests_in_parts"), (engine_quality, "camera_quality_in_parts")):
+    for module, name in ((engine_camera, "camera_tests_in_parts"), (engine_quality, "image_sums_in_parts")):
         monkeypatch.setattr(module, "AT_ONCE", 50)
         function = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, f=function, **k: asked.append(f) or f(*a, **k))

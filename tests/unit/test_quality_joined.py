@@ -9,7 +9,7 @@ import pytest
 from joint_reference import SPEC, model_of
 from numpy.testing import assert_array_equal
 
-from sfm_audit.audit.camera_quality.identifiability import parameter_covariance, parameter_covariances
+from sfm_audit.audit.camera_quality.identifiability import covariances_of_grams, parameter_covariance, unit_triangle
 from sfm_audit.audit.camera_quality.joined import qualities_of_joined
 from sfm_audit.audit.camera_quality.measure import CameraShape, camera_quality
 from sfm_audit.audit.cameras import project_columns
@@ -120,7 +120,11 @@ def test_covariances_in_doubt_are_left_to_their_image():
     columns[4, 3] = columns[4, 0] + 1e-7 * columns[4, 3]
     sigma_px = np.array([0.5, 0.5, 0.5, 0.5, np.nan])
     names = tuple("abcd")
-    for own, sigma, found in zip(columns, sigma_px, parameter_covariances(columns, names, sigma_px), strict=True):
+    grams = columns @ columns.swapaxes(1, 2)
+    together = covariances_of_grams(
+        grams, names, sigma_px, np.full(5, 12), lambda b, norms: unit_triangle(columns[b], norms)
+    )
+    for own, sigma, found in zip(columns, sigma_px, together, strict=True):
         alone = parameter_covariance(own, names, float(sigma))
         assert found.names == alone.names
         assert_array_equal(found.covariance, alone.covariance)
