@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from sfm_audit.audit.consistency import consistency_of
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
 from sfm_audit.loaders import open_model
@@ -34,7 +35,16 @@ def projection(model: SparseModel) -> Callable[[], object]:
     return lambda: model_residuals(model)
 
 
-SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {"projection": projection}
+def consistency(model: SparseModel) -> Callable[[], object]:
+    """Whether the parts of each image belong together."""
+    residuals = model_residuals(model)
+    return lambda: consistency_of(model, residuals)
+
+
+SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {
+    "projection": projection,
+    "consistency": consistency,
+}
 """From a model to what is timed; what it needs of the model is made before."""
 
 

@@ -175,7 +175,7 @@ def _judged(points: LinkedPoints, limits: ConsistencyLimits) -> ImageConsistency
             affine=affine,
             inconsistent=inconsistent,
             moved=suspect and not inconsistent,
-            half_pixel=_half_pixel(affine, limits),
+            half_pixel=half_pixel(affine, limits),
         )
     if 1.0 - share > limits.max_share_wrong:
         known = replace(known, inconsistent=True, moved=False)
@@ -202,7 +202,7 @@ def _is_tail(median_px: float, rms_px: float) -> bool:
     return median_px * _MIN_TAIL < rms_px
 
 
-def _half_pixel(affine: AffineFit | None, limits: ConsistencyLimits) -> int:
+def half_pixel(affine: AffineFit | None, limits: ConsistencyLimits) -> int:
     """+1 or -1 where A = 1 and the shift is +-(0.5, 0.5) px, within 5 sd, and is not 0 within 5 sd."""
     if affine is None:
         return 0

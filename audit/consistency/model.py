@@ -18,6 +18,7 @@ from sfm_audit.audit.consistency.image import (
     LinkedPoints,
     consistency_of_linked,
 )
+from sfm_audit.audit.consistency.together import clear_images
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.loaders.arrays import BoolArray
 from sfm_audit.loaders.model import SparseModel
@@ -72,8 +73,10 @@ def consistency_of(
     """Ask all images of a model, in file order, and the model; ``residuals`` of its inliers where they are at hand."""
     residuals = model_residuals(model) if residuals is None else residuals
     observations = model.observations
-    images = []
-    for image_idx in range(len(model.images)):
+    images = clear_images(model, residuals, limits)
+    for image_idx, found in enumerate(images):
+        if found is not None:
+            continue
         linked, rows = slice(*observations.offsets[image_idx : image_idx + 2]), residuals.rows(image_idx)
         points = LinkedPoints(
             model.image(image_idx),
@@ -85,8 +88,8 @@ def consistency_of(
             int(residuals.num_behind[image_idx]),
             int(residuals.num_unprojected[image_idx]),
         )
-        images.append(consistency_of_linked(points, limits))
-    return model_consistency(images, limits)
+        images[image_idx] = consistency_of_linked(points, limits)
+    return model_consistency([image for image in images if image is not None], limits)
 
 
 def model_consistency(

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_audit.audit.cameras import is_fisheye
-from sfm_audit.audit.inliers.sanity import are_usable
+from sfm_audit.audit.inliers.sanity import params_of, usable_cameras
 from sfm_audit.audit.inliers.stationarity import offsets_of_sums
 from sfm_audit.audit.kernels.projection import LENSES, NO_LENS, NUM_PARAMS, Projected, Scene, project_scene
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -124,19 +124,18 @@ def scene_of(model: SparseModel) -> Scene:
     """Return the observations, poses and cameras of a model as arrays."""
     observations, images, cameras = model.observations, model.images, model.cameras
     lenses, params = np.zeros((len(cameras), 3), dtype=np.int64), np.zeros((len(cameras), NUM_PARAMS))
-    lenses[:, 0] = NO_LENS
+    lenses[:, 0], is_usable = NO_LENS, usable_cameras(cameras)
     for model_id in distinct(cameras.model_id).tolist():
         lens = BY_ID[model_id]
         if lens.name not in LENSES:
             continue
-        rows = np.flatnonzero(cameras.model_id == model_id)
-        own = cameras.params[cameras.param_offsets[rows][:, None] + np.arange(lens.num_params)]
+        rows = np.flatnonzero((cameras.model_id == model_id) & is_usable)
+        if not len(rows):
+            continue
         focals, centre, extra = lens.focal_idxs, lens.principal_point_idxs, lens.extra_idxs
         chosen = [focals[0], focals[-1], *centre, *extra]
-        params[rows, : len(chosen)] = own[:, chosen]
-        is_odd = ~are_usable(own, own[:, list(focals)])
+        params[rows, : len(chosen)] = params_of(cameras, rows)[:, chosen]
         lenses[rows] = LENSES[lens.name], is_fisheye(lens), len(extra)
-        lenses[rows[is_odd]] = NO_LENS, 0, 0
     return Scene(
         observations.offsets,
         observations.point_idx,

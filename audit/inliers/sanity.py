@@ -10,8 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import BoolArray, FloatArray
-from sfm_audit.loaders.model import CameraRecord
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
+from sfm_audit.loaders.camera_models import BY_ID
+from sfm_audit.loaders.model import CameraRecord, CameraTable
 
 MAX_MAGNITUDE: Final = 1e12
 """Of a coordinate or a parameter, and of a derivative in units of the image's depth: squares, products stay finite."""
@@ -57,3 +58,19 @@ def is_usable(camera: CameraRecord) -> bool:
 def are_usable(params: FloatArray, focals_px: FloatArray) -> BoolArray:
     """Return the same (n,) of n cameras of one model: their parameters (n, p), and of these the focal lengths."""
     return np.asarray(is_sane(params).all(axis=1) & (np.abs(focals_px) >= _MIN_FOCAL_PX).all(axis=1))
+
+
+def usable_cameras(cameras: CameraTable) -> BoolArray:
+    """Return the same (C,) of all cameras of a model."""
+    out = np.zeros(len(cameras), dtype=np.bool_)
+    for model_id in distinct(cameras.model_id).tolist():
+        rows = np.flatnonzero(cameras.model_id == model_id)
+        params = params_of(cameras, rows)
+        out[rows] = are_usable(params, params[:, list(BY_ID[model_id].focal_idxs)])
+    return out
+
+
+def params_of(cameras: CameraTable, rows: IntArray) -> FloatArray:
+    """Return the parameters (n, p) of cameras of one model in these rows (n,), n > 0."""
+    first, last = cameras.param_offsets[rows[0] : rows[0] + 2]
+    return cameras.params[cameras.param_offsets[rows][:, None] + np.arange(last - first)]
