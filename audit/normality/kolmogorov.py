@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from scipy import special
 
-from sfm_audit.loaders.arrays import FloatArray, distinct
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 _Numbers = TypeVar("_Numbers", float, FloatArray)
 
@@ -20,6 +20,8 @@ _Numbers = TypeVar("_Numbers", float, FloatArray)
 TAIL_P = 0.05
 # Up to here every term of the one-sided sum is evaluated; beyond, this many of them (the terms are a smooth bell in j).
 MAX_TERMS = 512
+# Sums of that many terms whose temporaries stay in the processor's cache.
+_MAX_SUMS = 64
 # Below this many values Pelz and Good's series is replaced by Durbin's exact matrix.
 MIN_SERIES_VALUES = 80
 
@@ -89,35 +91,57 @@ def kolmogorov_p(distance: float, num_values: int) -> float:
     return min(1.0, float(1.0 - _pelz_good_cdf(scaled, num_values)))
 
 
-def kolmogorov_p_of_stack(distances: FloatArray, num_values: int) -> FloatArray:
-    """Return `kolmogorov_p` of the distances (B,), finite, of samples of one size."""
+def kolmogorov_p_of(distances: FloatArray, num_values: IntArray) -> FloatArray:
+    """Return `kolmogorov_p` of the distances (B,), finite, of samples of so many values (B,)."""
     p = np.where(distances >= 1.0, 0.0, 1.0)
-    open_ = np.flatnonzero((distances < 1.0) & (2.0 * num_values * distances > 1.0))
-    scaled = distances[open_] * math.sqrt(num_values)
-    tail = open_[2.0 * np.exp(-2.0 * scaled * scaled) < 2.0 * TAIL_P]
-    one_sided = _one_sided_of_stack(distances[tail], num_values)
+    open_ = (distances < 1.0) & (2.0 * num_values * distances > 1.0)
+    scaled = distances * np.sqrt(num_values)
+    tail = np.flatnonzero(open_ & (2.0 * np.exp(-2.0 * scaled * scaled) < 2.0 * TAIL_P))
+    one_sided = one_sided_p_of(distances[tail], num_values[tail])
     p[tail] = 2.0 * (one_sided - one_sided**4 + one_sided**9)
-    body = np.setdiff1d(open_, tail[p[tail] < TAIL_P], assume_unique=True)
-    if num_values < MIN_SERIES_VALUES:
-        p[body] = np.minimum(1.0, 1.0 - _durbin_of_stack(distances[body], num_values))
-    else:
-        scaled = distances[body] * math.sqrt(num_values)
-        p[body] = np.minimum(1.0, 1.0 - _pelz_good_cdf(scaled, num_values))
+    open_[tail[p[tail] < TAIL_P]] = False
+    for size in distinct(num_values[open_ & (num_values < MIN_SERIES_VALUES)]).tolist():
+        body = np.flatnonzero(open_ & (num_values == size))
+        p[body] = np.minimum(1.0, 1.0 - _durbin_of_stack(distances[body], size))
+    body = np.flatnonzero(open_ & (num_values >= MIN_SERIES_VALUES))
+    p[body] = np.minimum(1.0, 1.0 - _pelz_good_cdf(scaled[body], num_values[body]))
     return p
 
 
-def _one_sided_of_stack(distances: FloatArray, num_values: int) -> FloatArray:
-    """`one_sided_p` of (B,)."""
-    count, log_binomial = _log_binomials(num_values)
+def one_sided_p_of(distances: FloatArray, num_values: IntArray) -> FloatArray:
+    """Return `one_sided_p` of (B,) each."""
+    out = np.empty(distances.shape)
+    factorials = _log_factorials(int(num_values.max(initial=0)))
+    for start in range(0, len(out), _MAX_SUMS):
+        part = slice(start, start + _MAX_SUMS)
+        out[part] = _one_sided(distances[part, None], num_values[part, None], factorials)
+    return out
+
+
+def _one_sided(distance: FloatArray, num_values: IntArray, factorials: FloatArray) -> FloatArray:
+    """Sums (B,) of the terms of (B, 1) each."""
+    stride = -(-num_values // MAX_TERMS)
+    count = stride * np.arange(int((num_values // stride).max()) + 1)
+    np.minimum(count, num_values, out=count)
     fraction = count / num_values
-    rest = 1.0 - distances[:, None] - fraction
-    inside = (rest > 0.0) & (count <= np.floor(num_values * (1.0 - distances))[:, None])
-    log_terms = (
-        log_binomial
-        + (count - 1.0) * np.log(distances[:, None] + fraction)
-        + (num_values - count) * np.log(np.where(inside, rest, 1.0))
-    )
-    return np.asarray(distances * _stride(num_values) * np.where(inside, np.exp(log_terms), 0.0).sum(axis=1))
+    rest = 1.0 - distance - fraction
+    inside = (rest > 0.0) & (count <= np.floor(num_values * (1.0 - distance)))
+    inside[:, 1:] &= count[:, 1:] > count[:, :-1]
+    log_terms = factorials[num_values] - factorials[count] - factorials[num_values - count]
+    log_terms += (count - 1.0) * np.log(distance + fraction)
+    log_terms += (num_values - count) * np.log(np.where(inside, rest, 1.0))
+    terms = np.exp(np.where(inside, log_terms, -math.inf))
+    return np.asarray((distance * stride)[:, 0] * terms.sum(axis=1))
+
+
+def _log_factorials(largest: int) -> FloatArray:
+    """Ln 0!, ln 1!, ... up to that of ``largest`` at least."""
+    return _log_factorials_below(1 << max(largest, 1).bit_length())
+
+
+@lru_cache(maxsize=2)
+def _log_factorials_below(size: int) -> FloatArray:
+    return np.asarray(special.gammaln(np.arange(1.0, size + 1.0)))
 
 
 def one_sided_p(distance: float, num_values: int) -> float:
@@ -193,7 +217,7 @@ def _durbin_shape(size: int) -> tuple[FloatArray, FloatArray]:
     return np.where(row - col + 1 >= 0, 1.0, 0.0), special.gamma(np.maximum(row - col + 1, 0) + 1.0)
 
 
-def _pelz_good_cdf(x: _Numbers, num_values: int) -> _Numbers:
+def _pelz_good_cdf(x: _Numbers, num_values: _Numbers | int | IntArray) -> _Numbers:
     r"""P(sqrt(N) D_N < x) = K0 + K1 / sqrt(N) + K2 / N + K3 / N^(3/2), Pelz & Good's equations."""
     x2 = x * x
     s0, s1, s2, s3 = _ODD_POWERS @ np.exp(np.divide.outer(_ODD, -2.0 * x2))
@@ -209,6 +233,6 @@ def _pelz_good_cdf(x: _Numbers, num_values: int) -> _Numbers:
         + (212.0 * x2 - 60.0) * x2 * s2
         + (5.0 - 30.0 * x2) * s3
     ) / (6480.0 * x**10) + (3.0 * x2 * t1 - t2) / (216.0 * x**6)
-    root = math.sqrt(num_values)
+    root = np.sqrt(num_values)
     cdf: _Numbers = math.sqrt(2.0 * math.pi) * (k0 + (k1 + (k2 + k3 / root) / root) / root)
     return cdf

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
 from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 MIN_VALUES_DAGOSTINO = 8
 _Numbers = TypeVar("_Numbers", float, FloatArray)
@@ -78,40 +78,43 @@ def dagostino_pearson_from_shape(shape: Shape, num_values: int) -> Outcome:
     """:func:`dagostino_pearson` from the biased moments of num_values values."""
     if num_values < MIN_VALUES_DAGOSTINO or math.isnan(shape.skewness):
         return NOT_RUN
-    k2 = _skewness_z(shape.skewness, num_values) ** 2 + _kurtosis_z(shape.kurtosis_excess, num_values) ** 2
+    k2 = (
+        _skewness_z(shape.skewness, float(num_values)) ** 2 + _kurtosis_z(shape.kurtosis_excess, float(num_values)) ** 2
+    )
     return Outcome(float(k2), math.exp(-0.5 * k2))
 
 
-def dagostino_pearson_of_stack(skewness: FloatArray, kurtosis_excess: FloatArray, num_values: int) -> FloatArray:
-    """Return K^2 (B,) of the shapes (B,) each of samples of one size, at least 8."""
-    return np.asarray(_skewness_z(skewness, num_values) ** 2 + _kurtosis_z(kurtosis_excess, num_values) ** 2)
+def dagostino_pearson_of(skewness: FloatArray, kurtosis_excess: FloatArray, num_values: IntArray) -> FloatArray:
+    """Return K^2 (B,) of the shapes (B,) each of samples of so many values (B,); meaningless below 8."""
+    n = np.maximum(num_values, MIN_VALUES_DAGOSTINO).astype(np.float64)
+    return np.asarray(_skewness_z(skewness, n) ** 2 + _kurtosis_z(kurtosis_excess, n) ** 2)
 
 
-def _skewness_z(skewness: _Numbers, n: int) -> _Numbers:
+def _skewness_z(skewness: _Numbers, n: _Numbers) -> _Numbers:
     """D'Agostino (1970): standard normal under the null hypothesis, n >= 8."""
-    y = skewness * math.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
+    y = skewness * np.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
     beta2 = 3.0 * (n * n + 27.0 * n - 70.0) * (n + 1) * (n + 3) / ((n - 2.0) * (n + 5) * (n + 7) * (n + 9))
-    w2 = -1.0 + math.sqrt(2.0 * (beta2 - 1.0))
-    delta = 1.0 / math.sqrt(0.5 * math.log(w2))
-    alpha = math.sqrt(2.0 / (w2 - 1.0))
+    w2 = -1.0 + np.sqrt(2.0 * (beta2 - 1.0))
+    delta = 1.0 / np.sqrt(0.5 * np.log(w2))
+    alpha = np.sqrt(2.0 / (w2 - 1.0))
     z: _Numbers = delta * np.arcsinh(y / alpha)
     return z
 
 
-def _kurtosis_z(kurtosis_excess: _Numbers, n: int) -> _Numbers:
+def _kurtosis_z(kurtosis_excess: _Numbers, n: _Numbers) -> _Numbers:
     """Anscombe & Glynn (1983): standard normal under the null hypothesis."""
     mean = 3.0 * (n - 1) / (n + 1)
     variance = 24.0 * n * (n - 2) * (n - 3) / ((n + 1) * (n + 1.0) * (n + 3) * (n + 5))
-    x = (kurtosis_excess + 3.0 - mean) / math.sqrt(variance)
+    x = (kurtosis_excess + 3.0 - mean) / np.sqrt(variance)
     root_beta1 = (
         6.0
         * (n * n - 5.0 * n + 2.0)
         / ((n + 7) * (n + 9))
-        * math.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2.0) * (n - 3)))
+        * np.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2.0) * (n - 3)))
     )
-    a = 6.0 + 8.0 / root_beta1 * (2.0 / root_beta1 + math.sqrt(1.0 + 4.0 / root_beta1**2))
-    denominator = 1.0 + x * math.sqrt(2.0 / (a - 4.0))
+    a = 6.0 + 8.0 / root_beta1 * (2.0 / root_beta1 + np.sqrt(1.0 + 4.0 / root_beta1**2))
+    denominator = 1.0 + x * np.sqrt(2.0 / (a - 4.0))
     with np.errstate(divide="ignore"):
         term = np.copysign(np.cbrt((1.0 - 2.0 / a) / np.abs(denominator)), denominator)
-    z = np.where(denominator == 0.0, math.nan, (1.0 - 2.0 / (9.0 * a) - term) / math.sqrt(2.0 / (9.0 * a)))
+    z = np.where(denominator == 0.0, math.nan, (1.0 - 2.0 / (9.0 * a) - term) / np.sqrt(2.0 / (9.0 * a)))
     return cast("_Numbers", z)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache, lru_cache
 from importlib import resources
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 # Beyond the last entry log p goes on as in the table between this p and the last.
 SLOPE_FROM_P = 1e-3
@@ -44,16 +44,18 @@ class QuantileTable:
     quantile: FloatArray
 
 
-def modified_normal(distance: _Distance, num_values: int) -> _Distance:
+def modified_normal(distance: _Distance, num_values: int | IntArray) -> _Distance:
     """Stephens' D (sqrt N - 0.01 + 0.85 / sqrt N), for a normal distribution with estimated mean and sd."""
-    root = math.sqrt(num_values)
-    return distance * (root - 0.01 + 0.85 / root)
+    root: Any = num_values**0.5
+    modified: _Distance = distance * (root - 0.01 + 0.85 / root)
+    return modified
 
 
-def modified_exponential(distance: _Distance, num_values: int) -> _Distance:
+def modified_exponential(distance: _Distance, num_values: int | IntArray) -> _Distance:
     """Stephens' (D - 0.2 / n) (sqrt n + 0.26 + 0.5 / sqrt n), for an exponential distribution with estimated mean."""
-    root = math.sqrt(num_values)
-    return (distance - 0.2 / num_values) * (root + 0.26 + 0.5 / root)
+    root: Any = num_values**0.5
+    modified: _Distance = (distance - 0.2 / num_values) * (root + 0.26 + 0.5 / root)
+    return modified
 
 
 def null_p(table: NullTable, statistic: float, num_values: int) -> float:
@@ -81,13 +83,26 @@ def null_p(table: NullTable, statistic: float, num_values: int) -> float:
     return math.exp(float(log_p[-1]) + slope * (statistic**2 - float(knots[-1]) ** 2))
 
 
-def null_p_of_stack(table: NullTable, statistics: FloatArray, num_values: int) -> FloatArray:
-    """Return `null_p` of the statistics (B,) of samples of one size."""
-    if num_values < load(table).num_values[0]:
-        return np.full(statistics.shape, math.nan)
-    knots, log_p, slope = _curve(table, num_values)
-    beyond = log_p[-1] + slope * (statistics**2 - knots[-1] ** 2)
-    return np.exp(np.where(statistics <= knots[-1], np.interp(statistics, knots, log_p), beyond))
+def null_p_of(table: NullTable, statistics: FloatArray, num_values: IntArray) -> FloatArray:
+    """Return `null_p` of the statistics (B,) of samples of so many values (B,)."""
+    data = load(table)
+    log_p = np.concatenate(([0.0], np.log(data.p)))
+    above = np.searchsorted(data.num_values, num_values)
+    inverse_root = 1.0 / np.sqrt(data.num_values)
+    below = np.maximum(above - 1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (num_values**-0.5 - inverse_root[above]) / (inverse_root[below] - inverse_root[above])
+    share = np.where((data.num_values[above] == num_values) | (above == 0), 0.0, share)[:, None]
+    knots = np.zeros((len(statistics), len(log_p)))
+    knots[:, 1:] = share * data.quantile[below] + (1.0 - share) * data.quantile[above]
+    cell = np.clip((knots <= statistics[:, None]).sum(axis=1) - 1, 0, len(log_p) - 2)
+    left, right = np.take_along_axis(knots, np.stack([cell, cell + 1], axis=1), axis=1).T
+    slope = (log_p[cell + 1] - log_p[cell]) / (right - left)
+    inside = log_p[cell] + slope * np.maximum(statistics - left, 0.0)
+    end, start = knots[:, -1], int(np.argmin(np.abs(data.p - SLOPE_FROM_P))) + 1
+    slope = (log_p[-1] - log_p[start]) / (end**2 - knots[:, start] ** 2)
+    p = np.exp(np.where(statistics <= end, inside, log_p[-1] + slope * (statistics**2 - end**2)))
+    return np.where((num_values < data.num_values[0]) | np.isnan(statistics), math.nan, p)
 
 
 @cache

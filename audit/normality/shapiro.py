@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from scipy import special
 
 from sfm_audit.audit.normality.outcome import NOT_RUN, Outcome
 from sfm_audit.audit.normality.samples import in_safe_range, is_finite_sample
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+
+_Numbers = TypeVar("_Numbers", float, FloatArray)
 
 # Royston's fits hold for 3 <= N <= 5000.
 MIN_VALUES = 3
@@ -76,27 +80,38 @@ def shapiro_wilk_sorted(values_sorted: FloatArray) -> Outcome:
     return Outcome(1.0 - one_minus_w, _royston_p(one_minus_w, num_values))
 
 
-def shapiro_wilk_of_stack(values_sorted: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return W and p (B,) each of samples (B, N) in ascending order, 4 <= N <= 5000, in range and not all equal."""
-    num_values = values_sorted.shape[1]
-    weights = _half_weights(num_values)
-    half = len(weights)
-    projection = (values_sorted[:, : -half - 1 : -1] - values_sorted[:, :half]) @ weights
-    deviation = values_sorted - values_sorted.mean(axis=1, keepdims=True)
-    total = np.sqrt((deviation * deviation).sum(axis=1))
-    norm = math.sqrt(2.0 * float(weights @ weights))
-    one_minus_w = np.maximum(0.0, (norm * total - projection) * (norm * total + projection) / (norm * total) ** 2)
+def shapiro_wilk_of(statistics: Mapping[str, FloatArray], num_values: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return W and p (B,) each of samples of so many values (B,), NaN below 4, by `audit.normality.statistics`.
+
+    Royston's weights of all but the outermost values are scores divided by one number, such that all squares sum to 1.
+    """
+    n = np.maximum(num_values, MIN_VALUES + 1).astype(np.float64)
+    r, root = 1.0 / np.sqrt(n), np.sqrt(statistics["score_sq"])
+    first = _polynomial(_C1, r) + statistics["score_1"] / root
+    second = _polynomial(_C2, r) + statistics["score_2"] / root
+    has_second = n > 5
+    remaining = statistics["score_sq"] - 2.0 * statistics["score_1"] ** 2
+    remaining -= np.where(has_second, 2.0 * statistics["score_2"] ** 2, 0.0)
+    left = 1.0 - 2.0 * first**2 - np.where(has_second, 2.0 * second**2, 0.0)
+    none = num_values <= MIN_VALUES
+    scale = np.sqrt(np.where(none, 1.0, remaining) / np.where(none, 1.0, left))
+    second = np.where(has_second, second, statistics["score_2"] / scale)
+    projection = first * statistics["span_1"] + second * statistics["span_2"] + statistics["projection_rest"] / scale
+    total = np.sqrt(statistics["total_sq"])
+    one_minus_w = np.maximum(0.0, (total - projection) * (total + projection) / statistics["total_sq"])
+    return np.where(none, math.nan, 1.0 - one_minus_w), np.where(none, math.nan, _royston_p_of(one_minus_w, n))
+
+
+def _royston_p_of(one_minus_w: FloatArray, n: FloatArray) -> FloatArray:
+    """`_royston_p` of (B,) each, n > 3."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        y = np.log(one_minus_w)
-        if num_values <= 11:
-            gamma = _polynomial(_GAMMA, num_values)
-            mean, sd = _polynomial(_MEAN_SMALL, num_values), math.exp(_polynomial(_LOG_SD_SMALL, num_values))
-            p = np.where(y >= gamma, 0.0, special.ndtr((mean + np.log(gamma - y)) / sd))
-        else:
-            log_n = math.log(num_values)
-            mean, sd = _polynomial(_MEAN_LARGE, log_n), math.exp(_polynomial(_LOG_SD_LARGE, log_n))
-            p = special.ndtr((mean - y) / sd)
-    return 1.0 - one_minus_w, np.where(one_minus_w == 0.0, 1.0, p)
+        y, small = np.log(one_minus_w), n <= 11
+        gamma, log_n = _polynomial(_GAMMA, n), np.log(n)
+        mean = np.where(small, _polynomial(_MEAN_SMALL, n), _polynomial(_MEAN_LARGE, log_n))
+        log_sd = np.where(small, _polynomial(_LOG_SD_SMALL, n), _polynomial(_LOG_SD_LARGE, log_n))
+        p = special.ndtr((mean - np.where(small, -np.log(gamma - y), y)) / np.exp(log_sd))
+    p = np.where(small & (y >= gamma), 0.0, p)
+    return np.where(one_minus_w == 0.0, 1.0, p)
 
 
 @lru_cache(maxsize=64)
@@ -141,8 +156,8 @@ def _royston_p(one_minus_w: float, n: int) -> float:
     return float(special.ndtr((mean - y) / sd))
 
 
-def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    value = 0.0
+def _polynomial(coefficients: tuple[float, ...], x: _Numbers) -> _Numbers:
+    value = 0.0 * x
     for coefficient in reversed(coefficients):
         value = value * x + coefficient
     return value

@@ -4,6 +4,10 @@
 
 #include "kernel.h"
 
+#define LN2_HIGH 0.693147180369123816490 /* its last 20 bits are 0: times a whole number it is exact */
+#define LN2_LOW 1.90821492927058770002e-10
+#define WHOLE 6755399441055744.0 /* 1.5 * 2^52: added to a number, the last bits are its nearest whole number */
+
 enum { LANES = 4 };
 typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t LaneBits __attribute__((vector_size(LANES * sizeof(int64_t))));
@@ -41,20 +45,26 @@ INLINE Lanes root(Lanes x)
 INLINE Lanes mantissa(Lanes x) { return (Lanes)(((LaneBits)x & 0x000fffffffffffff) | 0x3ff0000000000000); }
 INLINE LaneBits biased_exponent(Lanes x) { return ((LaneBits)x >> 52) & 0x7ff; }
 
-/* ln(1 + u), u >= 0, 1 + u finite, to 1e-15 of itself. */
-INLINE Lanes log_1p(Lanes u)
+/* ln(x + lost) of normal x > 0, |lost| far below x, to 1e-15 of itself. */
+INLINE Lanes log_of(Lanes x, Lanes lost)
 {
-    const Lanes s = 1.0 + u, lost = (u - (s - 1.0)) / s;
-    Lanes m = mantissa(s);
+    Lanes m = mantissa(x);
     const LaneBits upper = m > 1.4142135623730951;
     m = choose(upper, 0.5 * m, m);
-    const LaneBits e = biased_exponent(s) - upper; /* true is -1 */
+    const LaneBits e = biased_exponent(x) - upper; /* true is -1 */
     const Lanes exponent = (Lanes)(e | 0x4330000000000000) - (4503599627370496.0 + 1023.0);
     const Lanes f = (m - 1.0) / (m + 1.0), t = f * f; /* ln m = 2 (f + f^3 / 3 + f^5 / 5 ...), t < 0.0295 */
     Lanes p = all(1.0 / 21.0);
     for (int k = 19; k > 1; k -= 2)
         p = p * t + 1.0 / k;
-    return exponent * 0.693147180369123816490 + (2.0 * f + (2.0 * f * t * p + (exponent * 1.90821492927058770002e-10 + lost)));
+    return exponent * LN2_HIGH + (2.0 * f + (2.0 * f * t * p + (exponent * LN2_LOW + lost / x)));
+}
+
+/* ln(1 + u), u >= 0, 1 + u finite, to 1e-15 of itself. */
+INLINE Lanes log_1p(Lanes u)
+{
+    const Lanes x = 1.0 + u;
+    return log_of(x, u - (x - 1.0));
 }
 
 /* exp(x), x <= 0; 0 below -708. */
@@ -62,9 +72,9 @@ INLINE Lanes exp_of_negative(Lanes x)
 {
     const LaneBits gone = x < -708.0;
     x = choose(gone, all(0.0), x);
-    const Lanes shifted = x * 1.4426950408889634 + 6755399441055744.0; /* 1.5 * 2^52: its last bits are a whole number */
-    const Lanes k = shifted - 6755399441055744.0;
-    const Lanes r = (x - k * 0.693147180369123816490) - k * 1.90821492927058770002e-10; /* |r| <= 0.347 */
+    const Lanes shifted = x * 1.4426950408889634 + WHOLE;
+    const Lanes k = shifted - WHOLE;
+    const Lanes r = (x - k * LN2_HIGH) - k * LN2_LOW; /* |r| <= 0.347 */
     static const double by_factorial[] = {1.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24, 1.0 / 120, 1.0 / 720, 1.0 / 5040,
                                           1.0 / 40320, 1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800, 1.0 / 479001600};
     Lanes p = all(1.0 / 6227020800.0);
