@@ -15,6 +15,7 @@ from sfm_audit.audit.consistency import fit_affine, image_consistency
 from sfm_audit.loaders.camera_models import BY_NAME
 from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
+pytestmark = pytest.mark.both_paths
 seeds = st.integers(0, 2**32 - 1)
 # (observed from projected, turn of the pose in rad): sound, half a pixel, moved, half size, turned, garbage
 faults = st.sampled_from(

@@ -25,6 +25,7 @@ from sfm_audit.audit.misfit import (
 )
 from sfm_audit.loaders.model import CameraRecord
 
+pytestmark = pytest.mark.both_paths
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from(sorted(PARAMS))
 

@@ -15,6 +15,7 @@ from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
 from sfm_audit.audit.simulate.demo import demo_scene
 from sfm_audit.audit.simulate.scene import simulate_scene
 
+pytestmark = pytest.mark.both_paths
 WORDS = ("verdict", "reasons", "severity", "misfit_group", "num_inliers", "num_behind", "num_nonfinite")
 
 
