@@ -24,6 +24,7 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.consistency import consistency_of
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
+from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.loaders import open_model
 from sfm_audit.loaders.model import SparseModel
 
@@ -41,9 +42,16 @@ def consistency(model: SparseModel) -> Callable[[], object]:
     return lambda: consistency_of(model, residuals)
 
 
+def misfit(model: SparseModel) -> Callable[[], object]:
+    """Misfit tests of all images, as the model stands."""
+    residuals = model_residuals(model)
+    return lambda: misfit_of_images(model, residuals, range(len(model.images)))
+
+
 SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {
     "projection": projection,
     "consistency": consistency,
+    "misfit": misfit,
 }
 """From a model to what is timed; what it needs of the model is made before."""
 

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.camera_quality.coverage import Spread, spread_of
+from sfm_audit.audit.camera_quality.identifiability import unit_triangle
 from sfm_audit.audit.camera_quality.joined import sums_of_joined
 from sfm_audit.audit.camera_quality.measure import (
     CameraQuality,
@@ -21,10 +22,11 @@ from sfm_audit.audit.camera_quality.measure import (
 from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.misfit import MisfitTests
+from sfm_audit.audit.misfit import MisfitTests, nuisance_columns
+from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import SparseModel, moved
 
 _MAX_POINTS_AT_ONCE: Final = 4096
 _POINTS_IN_A_TURN: Final = 1 << 16
@@ -84,11 +86,17 @@ def _sums_of(
     """What the inliers of images, with their cameras' shapes, add up to; of small images together."""
     alike: dict[tuple[int, int], list[int]] = {}
     out: dict[int, tuple[MisfitTests, PointSums]] = {}
+    num_of = np.diff(residuals.offsets)
+    tested = misfit_of_images(model, residuals, [i for i in image_idxs if num_of[i] > MAX_JOINED])
     for place, (shape, image_idx) in enumerate(zip(shapes, image_idxs, strict=True)):
         rows = residuals.rows(image_idx)
         num_inliers = rows.stop - rows.start
         if num_inliers <= MAX_JOINED:
             alike.setdefault((int(model.images.camera_idx[image_idx]), num_inliers), []).append(place)
+        elif image_idx in tested:
+            depth = _median_depth(model, image_idx, residuals.point_idx[rows])
+            triangle = partial(_triangle_of, model, residuals, image_idx)
+            out[place] = tested[image_idx].tests, PointSums(tested[image_idx].gram, 2 * num_inliers, depth, triangle)
         elif num_inliers <= AT_ONCE:
             out[place] = image_sums(shape.camera, image_inliers(model, residuals, image_idx))
         else:
@@ -100,6 +108,20 @@ def _sums_of(
             joined = joined_inliers(model, residuals, [image_idxs[place] for place in part], num_inliers)
             out.update(zip(part, sums_of_joined(shapes[part[0]].camera, joined, len(part)), strict=True))
     return [out[place][0] for place in range(len(out))], [out[place][1] for place in range(len(out))]
+
+
+def _median_depth(model: SparseModel, image_idx: int, point_idx: IntArray) -> float:
+    """`median_depth` of an image whose camera is no panorama."""
+    quat, translation = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
+    xyz_cam = moved(quat[image_idx], translation[image_idx], model.points.xyz_world.take(point_idx, axis=0))
+    return float(np.median(xyz_cam[:, 2]))
+
+
+def _triangle_of(model: SparseModel, residuals: ModelResiduals, image_idx: int, norms: FloatArray) -> FloatArray:
+    """`unit_triangle` of an image's columns."""
+    own = image_inliers(model, residuals, image_idx)
+    columns = nuisance_columns(own.camera.model, own.projected)
+    return unit_triangle(columns.reshape(len(columns), -1), norms)
 
 
 def _spread_of(

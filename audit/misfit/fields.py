@@ -26,7 +26,7 @@ _NUM_COLUMNS: Final = {
 }
 # Where a model's own coefficients act through its other ones, a unit of the coefficient is the unit of the field:
 # otherwise FULL_OPENCV with a denominator would not hold the radial group that it has.
-_OWN_COEFFICIENTS: Final[dict[str, dict[MisfitGroup, tuple[str, str]]]] = {
+OWN_COEFFICIENTS: Final[dict[str, dict[MisfitGroup, tuple[str, str]]]] = {
     "FULL_OPENCV": {MisfitGroup.RADIAL: ("k2", "k3")},
     "RAD_TAN_THIN_PRISM_FISHEYE": {MisfitGroup.RADIAL: ("k1", "k2"), MisfitGroup.TANGENTIAL: ("p1", "p0")},
 }
@@ -98,7 +98,7 @@ def _fill_lens(out: FloatArray, camera: CameraRecord, projected: ProjectedImage)
     affine[0, 0], affine[1, 0] = scale[0] * vx, scale[0] * vy
     principal_point = out[GROUP_COLUMNS[MisfitGroup.PRINCIPAL_POINT]]
     principal_point[0, 0], principal_point[1, 1] = scale[0], scale[1]
-    for group, names in _OWN_COEFFICIENTS.get(camera.model.name, {}).items():
+    for group, names in OWN_COEFFICIENTS.get(camera.model.name, {}).items():
         out[GROUP_COLUMNS[group]] = projected.d_params[[camera.model.param_names.index(name) for name in names]]
 
 

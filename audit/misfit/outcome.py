@@ -13,7 +13,7 @@ from sfm_audit.audit.table.words import MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 MIN_CLUSTERS_PER_RANK: Final = 4
-_SINGULAR_MEAT: Final = 1e-12  # smallest squared pivot of the meat with unit diagonal
+SINGULAR_MEAT: Final = 1e-12  # smallest squared pivot of the meat with unit diagonal
 
 
 class MisfitTest(NamedTuple):
@@ -114,7 +114,7 @@ def _whitened(scores: FloatArray, meat: FloatArray) -> FloatArray | None:
         factor = np.linalg.cholesky(meat / scale / scale[:, None])
     except np.linalg.LinAlgError:
         return None
-    if factor.diagonal().min() ** 2 <= _SINGULAR_MEAT:
+    if factor.diagonal().min() ** 2 <= SINGULAR_MEAT:
         return None
     return np.asarray(np.linalg.solve(factor, scores / scale))
 

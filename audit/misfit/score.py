@@ -30,10 +30,31 @@ class Clusters:
     members: IntArray
     starts: IntArray
 
+    @classmethod
+    def of(cls, clusters: IntArray | None) -> Clusters | None:
+        """Take the number of each observation's cluster, (n,); None if each observation is its own."""
+        if clusters is None:
+            return None
+        order = np.argsort(clusters, kind="stable").astype(np.int64)
+        is_start = np.diff(clusters[order], prepend=-1) != 0
+        has_twin = ~is_start | ~np.append(is_start[1:], True)
+        if not has_twin.any():
+            return None
+        return cls(order[has_twin], np.flatnonzero(is_start[has_twin]).astype(np.int64))
+
     @property
     def num_merged(self) -> int:
         """By how many the clusters are fewer than the observations."""
         return len(self.members) - len(self.starts)
+
+    def merge(self, g: FloatArray) -> None:
+        """Sum columns (c, n) over clusters, in place.
+
+        A cluster's sum stands at its first member; the others are zero, which adds nothing to the meat.
+        """
+        sums = np.add.reduceat(g.take(self.members, axis=1), self.starts, axis=1)
+        g[:, self.members] = 0.0
+        g[:, self.members[self.starts]] = sums
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +106,10 @@ class PreparedImage:
     def _tests(self, residuals_px: FloatArray) -> MisfitTests:
         y = basis.project_off(self.nuisance_basis, residuals_px.reshape(-1))
         scores = self.fields.reshape(len(self.fields), -1) @ y
-        g = self._per_cluster(y.reshape(2, -1) * self.inverse_root)
+        # both rows of each point of fields * y / sqrt(1 - h)
+        g = np.asarray(np.einsum("cin,in->cn", self.fields, y.reshape(2, -1) * self.inverse_root))
+        if self.clusters is not None:
+            self.clusters.merge(g)
         transform, ranks = self._joined_transform()
         meat = transform.T @ (g @ g.T) @ transform  # M = sum_k g_k g_k^T, of each group on the diagonal
         judged = iter(judged_by_f(transform.T @ scores, meat, ranks, self.num_clusters, self.num_observations))
@@ -114,19 +138,6 @@ class PreparedImage:
         own = self.fields[prepared.columns].reshape(len(prepared.transform), -1)
         along = prepared.transform @ (prepared.transform.T @ (own @ y))
         return np.asarray((along @ own).reshape(residuals_px.shape))
-
-    def _per_cluster(self, weighted: FloatArray) -> FloatArray:
-        """(42, n): both rows of each point of fields * y / sqrt(1 - h), summed, then summed over clusters.
-
-        A cluster's sum stands at its first member; the others are zero, which adds nothing to the meat.
-        """
-        g = np.asarray(np.einsum("cin,in->cn", self.fields, weighted))
-        if self.clusters is not None:
-            members, starts = self.clusters.members, self.clusters.starts
-            sums = np.add.reduceat(g.take(members, axis=1), starts, axis=1)
-            g[:, members] = 0.0
-            g[:, members[starts]] = sums
-        return g
 
 
 def prepare_image(
@@ -182,7 +193,7 @@ def prepare(
 def _prepare(nuisance: FloatArray, fields: FloatArray, clusters: IntArray | None, *, exact: bool) -> PreparedImage:
     """`prepare` in place of ``fields``."""
     n = fields.shape[2]
-    clustered = _clusters_of(clusters)
+    clustered = Clusters.of(clusters)
     columns = basis.unit_columns(nuisance.reshape(len(nuisance), -1))
     status = MisfitStatus.TESTED
     if not len(fields):
@@ -201,18 +212,6 @@ def _prepare(nuisance: FloatArray, fields: FloatArray, clusters: IntArray | None
     groups = _project_fields(q, fields.reshape(len(fields), -1), num_clusters, exact=exact)
     leverage = np.minimum(np.einsum("qm,qm->m", q, q), basis.MAX_LEVERAGE)
     return PreparedImage(q, fields, (1.0 / np.sqrt(1.0 - leverage)).reshape(2, n), groups, clustered)
-
-
-def _clusters_of(clusters: IntArray | None) -> Clusters | None:
-    """None if each observation is its own."""
-    if clusters is None:
-        return None
-    order = np.argsort(clusters, kind="stable").astype(np.int64)
-    is_start = np.diff(clusters[order], prepend=-1) != 0
-    has_twin = ~is_start | ~np.append(is_start[1:], True)
-    if not has_twin.any():
-        return None
-    return Clusters(order[has_twin], np.flatnonzero(is_start[has_twin]).astype(np.int64))
 
 
 def _project_fields(

@@ -11,7 +11,6 @@
 enum { LANES = 4 };
 typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t LaneBits __attribute__((vector_size(LANES * sizeof(int64_t))));
-#define INLINE static inline __attribute__((always_inline))
 #pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes lanes is inlined */
 
 INLINE Lanes load(const double *from)

@@ -1,0 +1,581 @@
+/* Sums over the observations of images, of which the misfit tests are made (docs/method.md section 5).
+ *
+ * An observation has rows along x and along y: the q columns N of its image's own fit, the residual, the lens fields S
+ * (radial 2, tangential 2) and the rolling shutter R (6); and 15 monomials m of the predicted point, degree 0 .. 4, which
+ * are fields along x and along y. Fields are made when asked for, SIZE observations at a time, and never stored.
+ * Monomials times monomials are moments: those of degree 0 .. 8 give all of them, along x and along y alike.
+ */
+#include "lanes.h"
+
+enum { SIZE = 64, MONOMIALS = 15, HIGHEST = 10, LENS = 4, SHUTTER = 6, MAX_OWN = 32, MAX_ROWS = MAX_OWN + 1 + LENS + SHUTTER };
+enum { NUM_FEATURES = LENS + SHUTTER + 2 * MONOMIALS, MAX_FEATURES = MAX_OWN + NUM_FEATURES };
+/* Numbers of an image: quaternion, translation, 3 x 3 from world gradients to the camera's, fx fy cx cy width height. */
+enum { QUAT = 0, SHIFT = 4, TURN = 7, LENS_NUMBERS = 16, NUM_NUMBERS = 22 };
+/* Facts of the camera model: distortion parameters, of which these are the radial and tangential groups (-1: none). */
+enum { NUM_EXTRA = 0, NUM_FOCALS, IS_FISHEYE, RADIAL_0, RADIAL_1, TANGENTIAL_0, TANGENTIAL_1, NUM_FACTS };
+static const double MAX_LEVERAGE = 1.0 - 1e-9, TINY_DEPTH = DBL_EPSILON;
+
+typedef Lanes lanes __attribute__((may_alias));
+typedef double row_t[SIZE] __attribute__((aligned(64)));
+
+/* The model, as it lies in memory. residuals: 2 rows, jacobian: 6 rows of these strides. */
+typedef struct {
+    const double *xyz_world, *xy_px, *residuals, *jacobian;
+    const int64_t *point, *observation, *facts;
+    int64_t residual_stride, jacobian_stride;
+} model_t;
+
+typedef struct {
+    int64_t start, stop;
+    const double *numbers, *d_extra;
+} image_t;
+
+/* x, y: N, residual, S, R along x and y.   m: monomials.   Zero behind the observations that there are. */
+typedef struct {
+    row_t x[MAX_ROWS], y[MAX_ROWS], m[MONOMIALS];
+    int64_t rows[SIZE];
+} block_t;
+
+/* What stands for an observation in the meat: rows N w, S w, R w, m w_x, m w_y; moments of w_x^2, w_x w_y, w_y^2. */
+typedef struct {
+    row_t g[MAX_FEATURES], squares[3 * MONOMIALS], w[2];
+    double largest_leverage;
+} scores_t;
+
+typedef struct {
+    block_t block;
+    scores_t scores;
+    row_t clusters[MAX_FEATURES];
+} scratch_t;
+
+static int own_columns(const int64_t *facts) { return (int)(6 + facts[NUM_FOCALS] + facts[NUM_EXTRA]); }
+
+static void *aligned_scratch(size_t size, void **to_free) {
+    *to_free = malloc(size + 64);
+    return *to_free ? (void *)(((uintptr_t)*to_free + 63) & ~(uintptr_t)63) : NULL;
+}
+
+/* sums[r][c] += row r of a times row c of b. Lanes are added in fixed order. */
+INLINE void tile(const row_t *a, const row_t *b, const int rows, const int columns,
+                                                       double *sums, int64_t stride) {
+    lanes s[3][4] = {{{0}}};
+    for (int k = 0; k < SIZE; k += 4)
+        for (int r = 0; r < rows; ++r) {
+            const lanes left = *(const lanes *)&a[r][k];
+            for (int c = 0; c < columns; ++c) s[r][c] += left * *(const lanes *)&b[c][k];
+        }
+    for (int r = 0; r < rows; ++r)
+        for (int c = 0; c < columns; ++c)
+            sums[r * stride + c] += sum(s[r][c]);
+}
+
+static WIDE void products(const row_t *a, int rows, const row_t *b, int columns, double *sums, int64_t stride) {
+    int r = 0;
+    for (; r + 3 <= rows; r += 3) {
+        int c = 0;
+        for (; c + 4 <= columns; c += 4) tile(a + r, b + c, 3, 4, sums + r * stride + c, stride);
+        for (; c < columns; ++c) tile(a + r, b + c, 3, 1, sums + r * stride + c, stride);
+    }
+    for (; r < rows; ++r) {
+        int c = 0;
+        for (; c + 4 <= columns; c += 4) tile(a + r, b + c, 1, 4, sums + r * stride + c, stride);
+        for (; c < columns; ++c) tile(a + r, b + c, 1, 1, sums + r * stride + c, stride);
+    }
+}
+
+/* Monomials of (x, y), by degree, then by the power of y. */
+INLINE void fill_monomials(block_t *b, const double *x, const double *y) {
+    for (int k = 0; k < SIZE; ++k) b->m[0][k] = 1.0, b->m[1][k] = x[k], b->m[2][k] = y[k];
+    for (int degree = 2; degree <= 4; ++degree) {
+        const int first = degree * (degree + 1) / 2, above = first - degree;
+        for (int j = 0; j < degree; ++j)
+            for (int k = 0; k < SIZE; ++k) b->m[first + j][k] = b->m[above + j][k] * x[k];
+        for (int k = 0; k < SIZE; ++k) b->m[first + degree][k] = b->m[first - 1][k] * y[k];
+    }
+}
+
+/* Six columns of the pose along one axis, of the gradient (3) in the camera and the point there. */
+INLINE void fill_pose(row_t *own, const row_t *gradient, const row_t *point) {
+    for (int k = 0; k < SIZE; ++k) {
+        const double jx = gradient[0][k], jy = gradient[1][k], jz = gradient[2][k];
+        const double x = point[0][k], y = point[1][k], z = point[2][k];
+        own[0][k] = jz * y - jy * z, own[1][k] = jx * z - jz * x, own[2][k] = jy * x - jx * y;
+        own[3][k] = jx, own[4][k] = jy, own[5][k] = jz;
+    }
+}
+
+INLINE void fill_points(const model_t *model, const image_t *image, const block_t *b, row_t *point) {
+    const double *q = image->numbers + QUAT, *t = image->numbers + SHIFT;
+    row_t world[3];
+    for (int k = 0; k < SIZE; ++k)
+        for (int j = 0; j < 3; ++j) world[j][k] = model->xyz_world[3 * model->point[b->rows[k]] + j];
+    for (int k = 0; k < SIZE; ++k) { /* Eigen's order of operations, as loaders.model.moved */
+        const double x = world[0][k], y = world[1][k], z = world[2][k];
+        const double ux = 2.0 * (q[2] * z - q[3] * y), uy = 2.0 * (q[3] * x - q[1] * z), uz = 2.0 * (q[1] * y - q[2] * x);
+        point[0][k] = x + q[0] * ux + (q[2] * uz - q[3] * uy) + t[0];
+        point[1][k] = y + q[0] * uy + (q[3] * ux - q[1] * uz) + t[1];
+        point[2][k] = z + q[0] * uz + (q[1] * uy - q[2] * ux) + t[2];
+    }
+}
+
+INLINE void fill_gradient(const model_t *model, const image_t *image, const block_t *b, int axis, row_t *gradient) {
+    const double *turn = image->numbers + TURN, *from = model->jacobian + 3 * axis * model->jacobian_stride;
+    for (int k = 0; k < SIZE; ++k) {
+        const double *own = from + b->rows[k];
+        const double x = own[0], y = own[model->jacobian_stride], z = own[2 * model->jacobian_stride];
+        for (int j = 0; j < 3; ++j) gradient[j][k] = turn[3 * j] * x + turn[3 * j + 1] * y + turn[3 * j + 2] * z;
+    }
+}
+
+/* The undistorted point u: (X, Y) / Z, of fisheyes theta (X, Y) / rho. */
+INLINE void undistorted(const row_t *point, int is_fisheye, double *ux, double *uy) {
+    for (int k = 0; k < SIZE; ++k) {
+        const double z = point[2][k] >= TINY_DEPTH ? point[2][k] : NAN;
+        ux[k] = point[0][k] / z, uy[k] = point[1][k] / z;
+    }
+    for (int k = 0; is_fisheye && k < SIZE; ++k) {
+        const double tan2 = ux[k] * ux[k] + uy[k] * uy[k], tangent = sqrt(tan2 < DBL_MIN ? DBL_MIN : tan2);
+        const double gain = arctan(tangent) / tangent;
+        ux[k] *= gain, uy[k] *= gain;
+    }
+}
+
+INLINE void fill_lens(row_t *x, row_t *y, const double *ux, const double *uy, const double *lens) {
+    const double fx = lens[0], fy = lens[1];
+    for (int k = 0; k < SIZE; ++k) {
+        const double r2 = ux[k] * ux[k] + uy[k] * uy[k], cross = 2.0 * ux[k] * uy[k];
+        x[0][k] = ux[k] * fx * (r2 * r2), y[0][k] = uy[k] * fy * (r2 * r2);
+        x[1][k] = x[0][k] * r2, y[1][k] = y[0][k] * r2;
+        x[2][k] = cross * fx, y[2][k] = (r2 + 2.0 * uy[k] * uy[k]) * fy;
+        x[3][k] = (r2 + 2.0 * ux[k] * ux[k]) * fx, y[3][k] = cross * fy;
+    }
+}
+
+INLINE void fill_extra(const image_t *image, const block_t *b, int idx, double *x, double *y) {
+    const int64_t num = image->stop - image->start;
+    const double *along_x = image->d_extra + 2 * idx * num, *along_y = along_x + num;
+    for (int k = 0; k < SIZE; ++k) x[k] = along_x[b->rows[k] - image->start], y[k] = along_y[b->rows[k] - image->start];
+}
+
+INLINE void fill_focals(block_t *b, int num_focals, const double *vx, const double *vy) {
+    memcpy(b->x[6], vx, sizeof(row_t)), memcpy(b->y[6], vy, sizeof(row_t));
+    if (num_focals < 2) return;
+    memcpy(b->y[7], vy, sizeof(row_t));
+    memset(b->y[6], 0, sizeof(row_t)), memset(b->x[7], 0, sizeof(row_t));
+}
+
+/* All rows of the first ``count`` observations in b->rows. */
+static WIDE void evaluate(const model_t *model, const image_t *image, int count, block_t *b) {
+    const int64_t *facts = model->facts;
+    const int q = own_columns(facts), num_rows = q + 1 + LENS + SHUTTER, first_extra = 6 + (int)facts[NUM_FOCALS];
+    const double *lens = image->numbers + LENS_NUMBERS;
+    const double half = 0.5 * (lens[4] > lens[5] ? lens[4] : lens[5]);
+    row_t point[3], gradient[3], ux, uy, px, py, x, y;
+    for (int k = count; k < SIZE; ++k) b->rows[k] = b->rows[count - 1];
+    fill_points(model, image, b, point);
+    for (int axis = 0; axis < 2; ++axis) {
+        fill_gradient(model, image, b, axis, gradient);
+        fill_pose(axis ? b->y : b->x, (const row_t *)gradient, (const row_t *)point);
+    }
+    for (int k = 0; k < SIZE; ++k) {
+        const double *seen = model->xy_px + 2 * model->observation[b->rows[k]];
+        b->x[q][k] = model->residuals[b->rows[k]], b->y[q][k] = model->residuals[model->residual_stride + b->rows[k]];
+        px[k] = seen[0] - b->x[q][k], py[k] = seen[1] - b->y[q][k];
+    }
+    for (int k = 0; k < SIZE; ++k) {
+        x[k] = (px[k] - 0.5 * lens[4]) / half, y[k] = (py[k] - 0.5 * lens[5]) / half;
+        ux[k] = (px[k] - lens[2]) / lens[0], uy[k] = (py[k] - lens[3]) / lens[1];
+    }
+    fill_monomials(b, x, y);
+    fill_focals(b, (int)facts[NUM_FOCALS], ux, uy);
+    for (int e = 0; e < facts[NUM_EXTRA]; ++e) fill_extra(image, b, e, b->x[first_extra + e], b->y[first_extra + e]);
+    undistorted((const row_t *)point, (int)facts[IS_FISHEYE], ux, uy);
+    fill_lens(b->x + q + 1, b->y + q + 1, ux, uy, lens);
+    for (int j = 0; j < LENS; ++j)
+        if (facts[RADIAL_0 + j] >= 0) fill_extra(image, b, (int)facts[RADIAL_0 + j], b->x[q + 1 + j], b->y[q + 1 + j]);
+    for (int j = 0; j < SHUTTER; ++j)
+        for (int k = 0; k < SIZE; ++k) {
+            const double row = (py[k] - 0.5 * lens[5]) / lens[5];
+            b->x[q + 1 + LENS + j][k] = b->x[j][k] * row, b->y[q + 1 + LENS + j][k] = b->y[j][k] * row;
+        }
+    if (count == SIZE) return;
+    const size_t empty = sizeof(double) * (size_t)(SIZE - count);
+    for (int j = 0; j < num_rows; ++j) memset(&b->x[j][count], 0, empty), memset(&b->y[j][count], 0, empty);
+    for (int j = 0; j < MONOMIALS; ++j) memset(&b->m[j][count], 0, empty);
+}
+
+static int fill_rows(int64_t from, int64_t stop, block_t *b) {
+    const int count = stop - from < SIZE ? (int)(stop - from) : SIZE;
+    for (int k = 0; k < count; ++k) b->rows[k] = from + k;
+    return count;
+}
+
+/* The sum of m_i m_j: low[j] has the moments of degree 0 .. 4, high[i][j] those of m_(10 + i) m_j. */
+static double moment(const double *low, const double *high, int64_t stride, int i, int j) {
+    int degree = 0, power = 0;
+    for (int k = 0; k < 2; ++k) {
+        const int own = k ? j : i;
+        int d = 0;
+        while ((d + 1) * (d + 2) / 2 <= own) ++d;
+        degree += d, power += own - d * (d + 1) / 2;
+    }
+    if (degree <= 4) return low[degree * (degree + 1) / 2 + power];
+    const int above = degree - 4, first = power < 4 ? power : 4;
+    return high[first * stride + above * (above + 1) / 2 + power - first];
+}
+
+static void set(double *out, int64_t size, int i, int j, double value) { out[i * size + j] = value, out[j * size + i] = value; }
+
+typedef struct {
+    double own[MAX_OWN * MAX_ROWS], on_y[LENS + SHUTTER], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
+    double along_x[MONOMIALS * (MAX_OWN + 1)], along_y[MONOMIALS * (MAX_OWN + 1)], low[MONOMIALS], high[5 * MONOMIALS];
+} sums_t;
+
+static void add_block(sums_t *s, const block_t *b, int q) {
+    const int num_rows = q + 1 + LENS + SHUTTER, lens = q + 1, shutter = lens + LENS;
+    for (int axis = 0; axis < 2; ++axis) {
+        const row_t *rows = axis ? b->y : b->x;
+        products(rows, q, rows, num_rows, s->own, MAX_ROWS);
+        products(rows + q, 1, rows + lens, LENS + SHUTTER, s->on_y, LENS + SHUTTER);
+        products(rows + lens, LENS, rows + lens, LENS, s->lens, LENS);
+        products(rows + shutter, SHUTTER, rows + shutter, SHUTTER, s->shutter, SHUTTER);
+        products(b->m, MONOMIALS, rows, q + 1, axis ? s->along_y : s->along_x, MAX_OWN + 1);
+    }
+    products(b->m, 1, b->m, MONOMIALS, s->low, MONOMIALS);
+    products(b->m + HIGHEST, 5, b->m, MONOMIALS, s->high, MONOMIALS);
+}
+
+/* gram (q + 40, q + 40) and on_y (q + 40); what the tests do not use stays zero. */
+static void write_sums(const sums_t *s, int q, double *gram, double *on_y) {
+    const int64_t size = q + NUM_FEATURES;
+    const int shutter = q + LENS, along_x = shutter + SHUTTER, along_y = along_x + MONOMIALS;
+    memset(gram, 0, sizeof(double) * (size_t)(size * size));
+    for (int i = 0; i < q; ++i) {
+        for (int j = 0; j <= i; ++j) set(gram, size, i, j, s->own[j * MAX_ROWS + i]);
+        for (int j = 0; j < LENS + SHUTTER; ++j) set(gram, size, i, q + j, s->own[i * MAX_ROWS + q + 1 + j]);
+        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_x + j, s->along_x[j * (MAX_OWN + 1) + i]);
+        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_y + j, s->along_y[j * (MAX_OWN + 1) + i]);
+        on_y[i] = s->own[i * MAX_ROWS + q];
+    }
+    for (int i = 0; i < LENS; ++i)
+        for (int j = 0; j <= i; ++j) set(gram, size, q + i, q + j, s->lens[i * LENS + j]);
+    for (int i = 0; i < SHUTTER; ++i)
+        for (int j = 0; j <= i; ++j) set(gram, size, shutter + i, shutter + j, s->shutter[i * SHUTTER + j]);
+    for (int i = 0; i < MONOMIALS; ++i)
+        for (int j = 0; j <= i; ++j) {
+            const double value = moment(s->low, s->high, MONOMIALS, i, j);
+            set(gram, size, along_x + i, along_x + j, value), set(gram, size, along_y + i, along_y + j, value);
+        }
+    for (int j = 0; j < LENS + SHUTTER; ++j) on_y[q + j] = s->on_y[j];
+    for (int j = 0; j < MONOMIALS; ++j) on_y[along_x + j] = s->along_x[j * (MAX_OWN + 1) + q];
+    for (int j = 0; j < MONOMIALS; ++j) on_y[along_y + j] = s->along_y[j * (MAX_OWN + 1) + q];
+}
+
+static image_t image_of(int64_t i, const int64_t *rows, const double *numbers, const int64_t *d_extra) {
+    const image_t image = {rows[2 * i], rows[2 * i + 1], numbers + NUM_NUMBERS * i, (const double *)(intptr_t)d_extra[i]};
+    return image;
+}
+
+/* First pass: Gram matrices of N and all features, and their products with the residuals. */
+KERNEL int64_t sfm_misfit_sums(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
+                               const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
+                               const int64_t *observation, const double *residuals, int64_t residual_stride,
+                               const double *jacobian, int64_t jacobian_stride, double *gram, double *on_y) {
+    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+    const int q = own_columns(facts);
+    const int64_t size = q + NUM_FEATURES;
+    void *to_free;
+    block_t *block = aligned_scratch(sizeof(block_t), &to_free);
+    if (!block || q > MAX_OWN) {
+        free(to_free);
+        return block ? NEEDS_NUMPY : NO_MEMORY;
+    }
+    for (int64_t i = 0; i < num_images; ++i) {
+        const image_t image = image_of(i, rows, numbers, d_extra);
+        sums_t sums;
+        memset(&sums, 0, sizeof sums);
+        for (int64_t from = image.start; from < image.stop; from += SIZE) {
+            evaluate(&model, &image, fill_rows(from, image.stop, block), block);
+            add_block(&sums, block, q);
+        }
+        write_sums(&sums, q, gram + i * size * size, on_y + i * size);
+    }
+    free(to_free);
+    return DONE;
+}
+
+/* w = (y - N c) / sqrt(1 - h) along x and y, h the squared length of the ``num`` rows of basis N. */
+static WIDE void weigh(const block_t *b, int q, const double *basis, int num, const double *c, scores_t *s) {
+    int length[MAX_OWN]; /* of each row of the basis, zeros at its end left out */
+    for (int i = 0; i < num; ++i)
+        for (length[i] = q; length[i] > 0 && basis[i * q + length[i] - 1] == 0.0;) --length[i];
+    double largest = s->largest_leverage;
+    for (int axis = 0; axis < 2; ++axis) {
+        const row_t *own = axis ? b->y : b->x;
+        row_t leverage;
+        for (int k = 0; k < SIZE; k += 8) {
+            lanes first = {0}, second = {0};
+            for (int i = 0; i < num; ++i) {
+                lanes left = {0}, right = {0};
+                for (int j = 0; j < length[i]; ++j) {
+                    left += basis[i * q + j] * *(const lanes *)&own[j][k];
+                    right += basis[i * q + j] * *(const lanes *)&own[j][k + 4];
+                }
+                first += left * left, second += right * right;
+            }
+            *(lanes *)&leverage[k] = first, *(lanes *)&leverage[k + 4] = second;
+        }
+        for (int k = 0; k < SIZE; ++k) largest = leverage[k] > largest ? leverage[k] : largest;
+        memcpy(s->w[axis], own[q], sizeof(row_t));
+        for (int j = 0; j < q; ++j)
+            for (int k = 0; k < SIZE; ++k) s->w[axis][k] -= c[j] * own[j][k];
+        for (int k = 0; k < SIZE; ++k)
+            s->w[axis][k] /= sqrt(1.0 - (leverage[k] < MAX_LEVERAGE ? leverage[k] : MAX_LEVERAGE));
+    }
+    s->largest_leverage = largest;
+}
+
+/* Both rows of each feature times w. */
+static WIDE void fill_scores(const block_t *b, int q, scores_t *s) {
+    const double *wx = s->w[0], *wy = s->w[1];
+    for (int j = 0; j < q + LENS + SHUTTER; ++j) {
+        const int from = j < q ? j : j + 1;
+        for (int k = 0; k < SIZE; ++k) s->g[j][k] = b->x[from][k] * wx[k] + b->y[from][k] * wy[k];
+    }
+    row_t *along_x = s->g + q + LENS + SHUTTER, *along_y = along_x + MONOMIALS;
+    for (int j = 0; j < MONOMIALS; ++j)
+        for (int k = 0; k < SIZE; ++k) along_x[j][k] = b->m[j][k] * wx[k], along_y[j][k] = b->m[j][k] * wy[k];
+}
+
+typedef struct {
+    double own[MAX_OWN * MAX_FEATURES], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
+    double low[3 * MONOMIALS], high[5 * 3 * MONOMIALS], smooth[4 * MONOMIALS * MONOMIALS];
+} meat_t;
+
+static void add_own(meat_t *meat, const row_t *g, int q) {
+    products(g, q, g, q + NUM_FEATURES, meat->own, MAX_FEATURES);
+    products(g + q, LENS, g + q, LENS, meat->lens, LENS);
+    products(g + q + LENS, SHUTTER, g + q + LENS, SHUTTER, meat->shutter, SHUTTER);
+}
+
+static WIDE void fill_squares(scores_t *s, int q) {
+    const row_t *along_x = (const row_t *)s->g + q + LENS + SHUTTER, *along_y = along_x + MONOMIALS;
+    const double *wx = s->w[0], *wy = s->w[1];
+    row_t *xx = s->squares, *xy = xx + MONOMIALS, *yy = xy + MONOMIALS;
+    for (int j = 0; j < MONOMIALS; ++j)
+        for (int k = 0; k < SIZE; ++k)
+            xx[j][k] = along_x[j][k] * wx[k], xy[j][k] = along_x[j][k] * wy[k], yy[j][k] = along_y[j][k] * wy[k];
+}
+
+static void add_single(meat_t *meat, const block_t *b, scores_t *s, int q) {
+    add_own(meat, (const row_t *)s->g, q);
+    fill_squares(s, q);
+    products(b->m, 1, (const row_t *)s->squares, 3 * MONOMIALS, meat->low, 3 * MONOMIALS);
+    products(b->m + HIGHEST, 5, (const row_t *)s->squares, 3 * MONOMIALS, meat->high, 3 * MONOMIALS);
+}
+
+static void add_clusters(meat_t *meat, row_t *sums, int count, int q) {
+    for (int j = 0; j < q + NUM_FEATURES; ++j) memset(&sums[j][count], 0, sizeof(double) * (size_t)(SIZE - count));
+    add_own(meat, (const row_t *)sums, q);
+    const row_t *smooth = (const row_t *)sums + q + LENS + SHUTTER;
+    products(smooth, 2 * MONOMIALS, smooth, 2 * MONOMIALS, meat->smooth, 2 * MONOMIALS);
+}
+
+static void write_meat(const meat_t *meat, int q, double *out) {
+    const int64_t size = q + NUM_FEATURES;
+    const int shutter = q + LENS, smooth = shutter + SHUTTER;
+    memset(out, 0, sizeof(double) * (size_t)(size * size));
+    for (int i = 0; i < q; ++i)
+        for (int j = i; j < size; ++j) set(out, size, i, j, meat->own[i * MAX_FEATURES + j]);
+    for (int i = 0; i < LENS; ++i)
+        for (int j = 0; j <= i; ++j) set(out, size, q + i, q + j, meat->lens[i * LENS + j]);
+    for (int i = 0; i < SHUTTER; ++i)
+        for (int j = 0; j <= i; ++j) set(out, size, shutter + i, shutter + j, meat->shutter[i * SHUTTER + j]);
+    for (int i = 0; i < 2 * MONOMIALS; ++i)
+        for (int j = 0; j <= i; ++j) {
+            const int axes = (i >= MONOMIALS) + (j >= MONOMIALS); /* 0: w_x^2, 1: w_x w_y, 2: w_y^2 */
+            const double *low = meat->low + axes * MONOMIALS, *high = meat->high + axes * MONOMIALS;
+            const double single = moment(low, high, 3 * MONOMIALS, i % MONOMIALS, j % MONOMIALS);
+            set(out, size, smooth + i, smooth + j, single + meat->smooth[i * 2 * MONOMIALS + j]);
+        }
+}
+
+/* Observations of an image whose keypoints lie in one pixel. head: the first of each observation's pixel, size: how many
+ * are there.   members: those of pixels of two and more, pixel by pixel. */
+typedef struct {
+    int64_t *head, *size, *members, *table, *column, *row;
+    int64_t capacity, num_members, num_clusters;
+    void *memory;
+} clusters_t;
+
+static int make_clusters(int64_t longest, clusters_t *c) {
+    c->capacity = 16;
+    while (c->capacity < 2 * longest) c->capacity *= 2;
+    int64_t *memory = malloc(sizeof(int64_t) * (size_t)(5 * longest + c->capacity));
+    c->memory = memory;
+    if (!memory) return NO_MEMORY;
+    c->head = memory, c->size = memory + longest, c->members = memory + 2 * longest;
+    c->column = memory + 3 * longest, c->row = memory + 4 * longest, c->table = memory + 5 * longest;
+    return DONE;
+}
+
+static int64_t first_of_pixel(clusters_t *c, int64_t i, int64_t capacity) {
+    uint64_t hash = (uint64_t)c->column[i] * 0x9E3779B97F4A7C15u + (uint64_t)c->row[i];
+    hash *= 0xD6E8FEB86659FD93u;
+    for (int64_t slot = (int64_t)((hash >> 32) & (uint64_t)(capacity - 1));; slot = (slot + 1) & (capacity - 1)) {
+        const int64_t other = c->table[slot];
+        if (other < 0) return c->table[slot] = i;
+        if (c->column[other] == c->column[i] && c->row[other] == c->row[i]) return other;
+    }
+}
+
+static int find_clusters(const model_t *model, const image_t *image, clusters_t *c) {
+    const int64_t num = image->stop - image->start;
+    int64_t capacity = 16, placed = 0;
+    while (capacity < 2 * num) capacity *= 2;
+    memset(c->table, -1, sizeof(int64_t) * (size_t)capacity);
+    c->num_clusters = 0;
+    for (int64_t i = 0; i < num; ++i) {
+        const double *seen = model->xy_px + 2 * model->observation[image->start + i];
+        if (!(fabs(seen[0]) < 1e15 && fabs(seen[1]) < 1e15)) return NEEDS_NUMPY;
+        c->column[i] = (int64_t)floor(seen[0]), c->row[i] = (int64_t)floor(seen[1]), c->size[i] = 0;
+        c->head[i] = first_of_pixel(c, i, capacity);
+        c->size[c->head[i]] += 1, c->num_clusters += c->head[i] == i;
+    }
+    for (int64_t i = 0; i < num; ++i) /* column: where the pixel's next member goes */
+        if (c->head[i] == i && c->size[i] > 1) c->column[i] = placed, placed += c->size[i];
+    for (int64_t i = 0; i < num; ++i)
+        if (c->size[c->head[i]] > 1) c->members[c->column[c->head[i]]++] = i;
+    c->num_members = placed;
+    return DONE;
+}
+
+/* What the profiled N of an image is: rows of an orthonormal basis (num, q) of it, and c (q) with y~ = y - N c. */
+typedef struct {
+    const double *basis, *on_y;
+    int num;
+} profile_t;
+
+static void meat_of_singles(const model_t *model, const image_t *image, const profile_t *profile, const clusters_t *c,
+                            scratch_t *scratch, meat_t *meat) {
+    const int q = own_columns(model->facts);
+    block_t *b = &scratch->block;
+    for (int64_t from = image->start; from < image->stop; from += SIZE) {
+        const int count = fill_rows(from, image->stop, b);
+        evaluate(model, image, count, b);
+        weigh(b, q, profile->basis, profile->num, profile->on_y, &scratch->scores);
+        for (int k = 0; k < count; ++k)
+            if (c->size[c->head[from - image->start + k]] > 1) scratch->scores.w[0][k] = scratch->scores.w[1][k] = 0.0;
+        fill_scores(b, q, &scratch->scores);
+        add_single(meat, b, &scratch->scores, q);
+    }
+}
+
+static void meat_of_clusters(const model_t *model, const image_t *image, const profile_t *profile, const clusters_t *c,
+                             scratch_t *scratch, meat_t *meat) {
+    const int q = own_columns(model->facts), size = q + NUM_FEATURES;
+    block_t *b = &scratch->block;
+    int at = -1; /* the column of the pixel's sums */
+    for (int64_t from = 0; from < c->num_members; from += SIZE) {
+        const int count = fill_rows(from, c->num_members, b);
+        for (int k = 0; k < count; ++k) b->rows[k] = image->start + c->members[from + k];
+        evaluate(model, image, count, b);
+        weigh(b, q, profile->basis, profile->num, profile->on_y, &scratch->scores);
+        fill_scores(b, q, &scratch->scores);
+        for (int k = 0; k < count; ++k) {
+            if (c->head[c->members[from + k]] == c->members[from + k]) {
+                if (at == SIZE - 1) add_clusters(meat, scratch->clusters, SIZE, q), at = -1;
+                ++at;
+                for (int j = 0; j < size; ++j) scratch->clusters[j][at] = 0.0;
+            }
+            for (int j = 0; j < size; ++j) scratch->clusters[j][at] += scratch->scores.g[j][k];
+        }
+    }
+    if (at >= 0) add_clusters(meat, scratch->clusters, at + 1, q);
+}
+
+/* Second pass: the meat, observations of a pixel as one, and how many there are. leverage: the largest. */
+KERNEL int64_t sfm_misfit_meat(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
+                               const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
+                               const int64_t *observation, const double *residuals, int64_t residual_stride,
+                               const double *jacobian, int64_t jacobian_stride, const double *basis, const double *on_y,
+                               double *meat, double *leverage, int64_t *num_clusters) {
+    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+    const int q = own_columns(facts);
+    const int64_t size = q + NUM_FEATURES;
+    int64_t longest = 1;
+    for (int64_t i = 0; i < num_images; ++i)
+        if (rows[2 * i + 1] - rows[2 * i] > longest) longest = rows[2 * i + 1] - rows[2 * i];
+    void *to_free;
+    clusters_t clusters;
+    scratch_t *scratch = aligned_scratch(sizeof(scratch_t), &to_free);
+    const int status = make_clusters(longest, &clusters);
+    if (!scratch || status != DONE || q > MAX_OWN) {
+        free(to_free), free(clusters.memory);
+        return q > MAX_OWN ? NEEDS_NUMPY : NO_MEMORY;
+    }
+    for (int64_t i = 0; i < num_images; ++i) {
+        const image_t image = image_of(i, rows, numbers, d_extra);
+        const profile_t profile = {basis + i * q * q, on_y + i * q, q};
+        meat_t sums;
+        num_clusters[i] = -1;
+        if (find_clusters(&model, &image, &clusters) != DONE) continue;
+        memset(&sums, 0, sizeof sums);
+        scratch->scores.largest_leverage = 0.0;
+        meat_of_singles(&model, &image, &profile, &clusters, scratch, &sums);
+        meat_of_clusters(&model, &image, &profile, &clusters, scratch, &sums);
+        write_meat(&sums, q, meat + i * size * size);
+        leverage[i] = scratch->scores.largest_leverage, num_clusters[i] = clusters.num_clusters;
+    }
+    free(to_free), free(clusters.memory);
+    return DONE;
+}
+
+/* g minus what the profile explains of it: g_j -= sum_i coefficients (q, 40) of (N w)_i. */
+static WIDE void project_scores(scores_t *s, int q, const double *coefficients) {
+    for (int j = 0; j < NUM_FEATURES; ++j)
+        for (int i = 0; i < q; ++i) {
+            const double factor = coefficients[i * NUM_FEATURES + j];
+            for (int k = 0; k < SIZE; ++k) s->g[q + j][k] -= factor * s->g[i][k];
+        }
+}
+
+/* Second pass of images that share a camera: what each observation adds to its track, tracks first .. last - 1. */
+KERNEL int64_t sfm_misfit_tracks(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
+                                 const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
+                                 const int64_t *observation, const double *residuals, int64_t residual_stride,
+                                 const double *jacobian, int64_t jacobian_stride, const double *basis, int64_t basis_rows,
+                                 const double *on_y, const double *coefficients, const int64_t *track_of_point,
+                                 int64_t first, int64_t last, double *per_track) {
+    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+    const int q = own_columns(facts);
+    void *to_free;
+    scratch_t *scratch = aligned_scratch(sizeof(scratch_t), &to_free);
+    if (!scratch || q > MAX_OWN) {
+        free(to_free);
+        return scratch ? NEEDS_NUMPY : NO_MEMORY;
+    }
+    block_t *b = &scratch->block;
+    for (int64_t i = 0; i < num_images; ++i) {
+        const image_t image = image_of(i, rows, numbers, d_extra);
+        for (int64_t from = image.start; from < image.stop;) {
+            int count = 0;
+            for (; from < image.stop && count < SIZE; ++from) {
+                const int64_t track = track_of_point[point[from]];
+                b->rows[count] = from;
+                count += track >= first && track < last;
+            }
+            if (!count) break;
+            evaluate(&model, &image, count, b);
+            weigh(b, q, basis + i * basis_rows * q, (int)basis_rows, on_y + i * q, &scratch->scores);
+            fill_scores(b, q, &scratch->scores);
+            project_scores(&scratch->scores, q, coefficients + i * q * NUM_FEATURES);
+            for (int k = 0; k < count; ++k) {
+                double *own = per_track + (track_of_point[point[b->rows[k]]] - first) * NUM_FEATURES;
+                for (int j = 0; j < NUM_FEATURES; ++j) own[j] += scratch->scores.g[q + j][k];
+            }
+        }
+    }
+    free(to_free);
+    return DONE;
+}

@@ -1,0 +1,202 @@
+"""What the candidate fields of an image are made of, and the sums over observations that the score tests need.
+
+The 42 fields of `audit.misfit.fields` lie in the span of 40 *features* in the units of the test: radial (2) and
+tangential (2) columns, rolling shutter (6), and 15 monomials of degree 0 to 4 of the predicted point, along x and along
+y. The principal point's columns are the constant ones, the affine ones are the first monomials about another centre.
+Monomials times monomials are moments, the same along x and y. `audit.kernels.misfit` sums up the same in C.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from sfm_audit.audit.inliers.projected import ProjectedImage
+from sfm_audit.audit.kernels.misfit import NUM_FEATURES
+from sfm_audit.audit.misfit import basis
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, OWN_COEFFICIENTS
+from sfm_audit.audit.misfit.nuisance import nuisance_columns
+from sfm_audit.audit.table.words import MisfitGroup
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord
+
+NUM_MONOMIALS: Final = 15
+LENS: Final = slice(0, 4)
+SHUTTER: Final = slice(4, 10)
+ALONG_X: Final = slice(10, 25)
+ALONG_Y: Final = slice(25, 40)
+_AFFINE: Final = GROUP_COLUMNS[MisfitGroup.AFFINE]
+
+
+def _feature_of_field() -> IntArray:
+    """(42,) the feature that each field is, in its own unit; of the affine ones the first monomials along x."""
+    out = np.empty(NUM_FIELDS, dtype=np.int64)
+    along_x, along_y = np.arange(ALONG_X.start, ALONG_X.stop), np.arange(ALONG_Y.start, ALONG_Y.stop)
+    out[GROUP_COLUMNS[MisfitGroup.RADIAL]] = 0, 1
+    out[GROUP_COLUMNS[MisfitGroup.TANGENTIAL]] = 2, 3
+    out[_AFFINE] = along_x[1:3]
+    out[GROUP_COLUMNS[MisfitGroup.PRINCIPAL_POINT]] = along_x[0], along_y[0]
+    out[GROUP_COLUMNS[MisfitGroup.ROLLING_SHUTTER]] = np.arange(SHUTTER.start, SHUTTER.stop)
+    out[GROUP_COLUMNS[MisfitGroup.SMOOTH]] = np.concatenate([along_x[1:], along_y[1:]])
+    return out
+
+
+FEATURE_OF_FIELD: Final = _feature_of_field()
+FIELD_OF_FEATURE: Final = np.array(
+    [max(np.flatnonzero(feature == FEATURE_OF_FIELD).tolist()) for feature in range(NUM_FEATURES)], dtype=np.int64
+)
+"""(40,) of the two fields that begin with the same monomial the smooth one, which is that monomial."""
+
+
+class ImageFeatures(NamedTuple):
+    """One image: own (q, 2, n) N, residuals_px (2, n), lens (4, 2, n), shutter (6, 2, n), monomials (15, n)."""
+
+    own: FloatArray
+    residuals_px: FloatArray
+    lens: FloatArray
+    shutter: FloatArray
+    monomials: FloatArray
+
+
+def image_features(camera: CameraRecord, projected: ProjectedImage, residuals_px: FloatArray) -> ImageFeatures:
+    """Return the features of an image, of a camera that has fields, from what it predicts and residuals (2, n)."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left to `prepare`
+        row = (projected.xy_px[1] - 0.5 * camera.height) / camera.height
+        return ImageFeatures(
+            nuisance_columns(camera.model, projected),
+            residuals_px,
+            _lens(camera, projected),
+            projected.pose * row,
+            _monomials(camera, projected.xy_px),
+        )
+
+
+def affine_offset(camera: CameraRecord) -> tuple[float, float]:
+    """Return what of the constant feature the affine fields hold beside the first monomials in x and in y."""
+    half = 0.5 * max(camera.width, camera.height)
+    cx, cy = (float(camera.params[i]) for i in camera.model.principal_point_idxs)
+    return (0.5 * camera.width - cx) / half, (0.5 * camera.height - cy) / half
+
+
+def _lens(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
+    """Radial and tangential columns of `candidate_fields`."""
+    focals = camera.model.focal_idxs
+    scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
+    u = projected.u
+    square = u * u
+    r2 = square[0] + square[1]
+    out = np.empty((4, *u.shape))
+    np.multiply(u * scale, r2 * r2, out=out[0])
+    np.multiply(out[0], r2, out=out[1])
+    out[3, 1] = out[2, 0] = 2.0 * u[0] * u[1]
+    out[2, 1] = r2 + 2.0 * square[1]
+    out[3, 0] = r2 + 2.0 * square[0]
+    out[2:] *= scale
+    starts = {MisfitGroup.RADIAL: 0, MisfitGroup.TANGENTIAL: 2}
+    for group, names in OWN_COEFFICIENTS.get(camera.model.name, {}).items():
+        own = [camera.model.param_names.index(name) for name in names]
+        out[starts[group] : starts[group] + 2] = projected.d_params[own]
+    return out
+
+
+def _monomials(camera: CameraRecord, xy_px: FloatArray) -> FloatArray:
+    """(15, n) of (predicted - (w, h) / 2) / (max(w, h) / 2): by degree, then by the power of y."""
+    half = 0.5 * max(camera.width, camera.height)
+    out = np.empty((NUM_MONOMIALS, xy_px.shape[1]))
+    out[0] = 1.0
+    np.divide(xy_px - np.array([[0.5 * camera.width], [0.5 * camera.height]]), half, out=out[1:3])
+    x, y = out[1], out[2]
+    for degree in range(2, 5):
+        first = degree * (degree + 1) // 2
+        above = out[first - degree : first]
+        np.multiply(above, x, out=out[first : first + degree])
+        np.multiply(above[-1], y, out=out[first + degree])
+    return out
+
+
+def sums_of(features: ImageFeatures) -> tuple[FloatArray, FloatArray]:
+    """Return the Gram matrix (q + 40, q + 40) of N and the features, and their products with the residuals (q + 40,).
+
+    Used are N with all, radial and tangential ones, rolling shutter, and monomials, each among themselves; the rest is
+    zero here and there.
+    """
+    own, y, lens, shutter, m = features
+    q, (lens_end, shutter_end) = len(own), (len(own) + 5, len(own) + 11)
+    rows = np.concatenate([own, y[None], lens, shutter])
+    flat = rows.reshape(len(rows), -1)
+    along_x, along_y = rows[: q + 1, 0] @ m.T, rows[: q + 1, 1] @ m.T
+    with_own, moments = flat[: q + 1] @ flat.T, m @ m.T
+    gram = np.zeros((q + NUM_FEATURES, q + NUM_FEATURES))
+    gram[:q, :q] = with_own[:q, :q]
+    gram[:q, q : q + SHUTTER.stop] = with_own[:q, q + 1 :]
+    gram[:q, q:][:, ALONG_X], gram[:q, q:][:, ALONG_Y] = along_x[:q], along_y[:q]
+    gram[q:, :q] = gram[:q, q:].T
+    of_features = gram[q:, q:]
+    of_features[LENS, LENS] = flat[q + 1 : lens_end] @ flat[q + 1 : lens_end].T
+    of_features[SHUTTER, SHUTTER] = flat[lens_end:shutter_end] @ flat[lens_end:shutter_end].T
+    of_features[ALONG_X, ALONG_X] = of_features[ALONG_Y, ALONG_Y] = moments
+    on_y = np.concatenate([with_own[q, :q], with_own[q, q + 1 :], along_x[q], along_y[q]])
+    return gram, on_y
+
+
+def weights_of(features: ImageFeatures, to_basis: FloatArray, on_y: FloatArray) -> tuple[FloatArray, float]:
+    """Return (y - N c) / sqrt(1 - h), (2, n), and the largest h, the squared length of what ``to_basis`` N says.
+
+    Parameters
+    ----------
+    to_basis : (r, q)        on_y : (q,) c
+    """
+    q, n = features.own.shape[0], features.residuals_px.shape[1]
+    flat = features.own.reshape(q, 2 * n)
+    along = to_basis @ flat
+    leverage = np.einsum("rm,rm->m", along, along)
+    left = features.residuals_px.reshape(2 * n) - on_y @ flat
+    weights = left / np.sqrt(1.0 - np.minimum(leverage, basis.MAX_LEVERAGE))
+    return weights.reshape(2, n), float(leverage.max(initial=0.0))
+
+
+def scores_of(features: ImageFeatures, weights: FloatArray) -> FloatArray:
+    """Return (q + 40, n): both rows of N and of each feature times weights (2, n), summed."""
+    q = len(features.own)
+    out = np.empty((q + NUM_FEATURES, weights.shape[1]))
+    of_features = out[q:]
+    np.einsum("cin,in->cn", features.own, weights, out=out[:q])
+    np.einsum("cin,in->cn", features.lens, weights, out=of_features[LENS])
+    np.einsum("cin,in->cn", features.shutter, weights, out=of_features[SHUTTER])
+    np.multiply(features.monomials, weights[0], out=of_features[ALONG_X])
+    np.multiply(features.monomials, weights[1], out=of_features[ALONG_Y])
+    return out
+
+
+def widened(matrix: FloatArray, offset: FloatArray, num_own: int) -> FloatArray:
+    """Return matrices of N and fields, (..., q + 42, q + 42), from those of N and features, with `affine_offset`s.
+
+    Parameters
+    ----------
+    matrix : (B, q + 40, q + 40)        offset : (B, 2)
+    """
+    chosen = _chosen(num_own)
+    out = matrix[:, chosen[:, None], chosen]
+    affine, constant = _affine_and_constant(num_own)
+    out[:, affine, :] += offset[:, :, None] * out[:, constant, None, :]
+    out[:, :, affine] += offset[:, None, :] * out[:, :, constant, None]
+    return np.asarray(out)
+
+
+def widened_columns(columns: FloatArray, offset: FloatArray, num_own: int) -> FloatArray:
+    """Return (B, q + 42) products of N and fields from (B, q + 40) of N and features."""
+    out = columns[:, _chosen(num_own)]
+    affine, constant = _affine_and_constant(num_own)
+    out[:, affine] += offset * out[:, constant, None]
+    return np.asarray(out)
+
+
+def _chosen(num_own: int) -> IntArray:
+    return np.concatenate([np.arange(num_own), num_own + FEATURE_OF_FIELD])
+
+
+def _affine_and_constant(num_own: int) -> tuple[slice, int]:
+    """Where the affine columns are, and the constant along x."""
+    constant = num_own + GROUP_COLUMNS[MisfitGroup.PRINCIPAL_POINT].start
+    return slice(num_own + _AFFINE.start, num_own + _AFFINE.stop), constant

@@ -1,0 +1,229 @@
+"""What the score tests need of a model's observations, summed up for some images at once: compiled, or with numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from sfm_audit.audit.cameras.models import functions_of
+from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.kernels import kernels_in_use
+from sfm_audit.audit.kernels.misfit import (
+    MAX_OWN,
+    NUM_FEATURES,
+    Observed,
+    Tracks,
+    Window,
+    misfit_meat,
+    misfit_sums,
+    misfit_tracks,
+)
+from sfm_audit.audit.misfit.clusters import coincident_keypoints
+from sfm_audit.audit.misfit.features import (
+    ImageFeatures,
+    affine_offset,
+    image_features,
+    scores_of,
+    sums_of,
+    weights_of,
+)
+from sfm_audit.audit.misfit.fields import OWN_COEFFICIENTS
+from sfm_audit.audit.misfit.in_parts import AT_ONCE
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
+from sfm_audit.audit.misfit.pooled import add_rows
+from sfm_audit.audit.misfit.score import Clusters
+from sfm_audit.audit.table.words import MisfitGroup
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.camera_models import CameraModel
+from sfm_audit.loaders.model import CameraRecord, SparseModel, rotation_from_quat
+
+_MAX_IMAGES: Final = 64
+_MAX_OBSERVATIONS: Final = 1 << 17
+_FEW_OBSERVATIONS: Final = 1 << 14  # whose features are in memory at the same time
+
+
+class ModelSums:
+    """Sums over the observations of images of one model, compiled where there are kernels.
+
+    Parameters
+    ----------
+    model, residuals : the model and its inliers
+    """
+
+    def __init__(self, model: SparseModel, residuals: ModelResiduals) -> None:
+        self._model, self._residuals = model, residuals
+
+    @cached_property
+    def observed(self) -> Observed:
+        """What kernels take of the model."""
+        residuals = self._residuals
+        return Observed.of(
+            self._model.points.xyz_world,
+            self._model.observations.xy_px,
+            (residuals.point_idx, residuals.observation_row),
+            residuals.residuals_px,
+            residuals.point_jacobian,
+        )
+
+    def camera(self, image: int) -> CameraRecord:
+        """Of the image in this row, which has inliers."""
+        return self._model.camera(int(self._model.images.camera_idx[image]))
+
+    def num_of(self, image: int) -> int:
+        """Inliers of the image in this row."""
+        rows = self._residuals.rows(image)
+        return int(rows.stop - rows.start)
+
+    def inliers(self, image: int) -> ImageInliers:
+        """Inliers of the image in this row."""
+        return image_inliers(self._model, self._residuals, image)
+
+    def keypoints(self, image: int) -> FloatArray:
+        """(n, 2) observed, of the image in this row."""
+        row = self._residuals.observation_row[self._residuals.rows(image)]
+        return self._model.observations.xy_px.take(row, axis=0)
+
+    def points(self, image: int) -> IntArray:
+        """(n,) rows of the points that the image in this row sees."""
+        return self._residuals.point_idx[self._residuals.rows(image)]
+
+    def can_sum(self, image: int) -> bool:
+        """Whether the image in this row has fields, and room for its columns."""
+        model, num = self.camera(image).model, self.num_of(image)
+        if model.is_spherical or not num:
+            return False
+        compiled = kernels_in_use() and 6 + len(fitted_param_idxs(model)) <= MAX_OWN
+        return compiled or num <= AT_ONCE
+
+    def features(self, image: int) -> ImageFeatures:
+        """Features of the image in this row."""
+        own = self.inliers(image)
+        return image_features(own.camera, own.projected, own.residuals_px)
+
+    def windows(self, images: Sequence[int]) -> Iterator[WindowSums]:
+        """Yield images of one camera model, as many as are summed up at a time; each of them `can_sum`."""
+        largest = _MAX_OBSERVATIONS if kernels_in_use() else _FEW_OBSERVATIONS
+        by_model: dict[str, list[int]] = {}
+        for image in images:
+            by_model.setdefault(self.camera(image).model.name, []).append(image)
+        for alike in by_model.values():
+            window: list[int] = []
+            size = 0
+            for image in alike:
+                if window and (len(window) == _MAX_IMAGES or size + self.num_of(image) > largest):
+                    yield WindowSums(self, window)
+                    window, size = [], 0
+                window.append(image)
+                size += self.num_of(image)
+            yield WindowSums(self, window)
+
+    def window(self, images: Sequence[int], cameras: Sequence[CameraRecord]) -> Window:
+        """Return what kernels take of images of one camera model."""
+        offsets, table = self._residuals.offsets, self._model.images
+        chosen = np.array(images, dtype=np.int64)
+        quats = table.quat_cam_from_world_wxyz[chosen]
+        numbers = np.empty((len(images), 22))
+        numbers[:, :4], numbers[:, 4:7] = quats, table.translation_cam_from_world[chosen]
+        numbers[:, 7:16] = np.linalg.pinv(rotation_from_quat(quats).swapaxes(1, 2)).reshape(-1, 9)
+        numbers[:, 16:] = [_lens_numbers(camera) for camera in cameras]
+        rows = np.stack([offsets[chosen], offsets[chosen + 1]], axis=1).astype(np.int64)
+        extra = tuple(self._residuals.d_extra[image] for image in images)
+        return Window(np.ascontiguousarray(rows), numbers, _facts(cameras[0].model), extra)
+
+
+def _lens_numbers(camera: CameraRecord) -> tuple[float, ...]:
+    focals, centre = camera.model.focal_idxs, camera.model.principal_point_idxs
+    wanted = (focals[0], focals[-1], *centre)
+    return (*camera.params[list(wanted)].tolist(), float(camera.width), float(camera.height))
+
+
+def _facts(model: CameraModel) -> IntArray:
+    own = OWN_COEFFICIENTS.get(model.name, {})
+    names = [*own.get(MisfitGroup.RADIAL, ("", "")), *own.get(MisfitGroup.TANGENTIAL, ("", ""))]
+    extras = [model.param_names[i] for i in model.extra_idxs]
+    which = [extras.index(name) if name else -1 for name in names]
+    is_fisheye = functions_of(model).is_fisheye
+    return np.array([len(extras), len(model.focal_idxs), is_fisheye, *which], dtype=np.int64)
+
+
+class WindowSums:
+    """Some images of one camera model.
+
+    images: (B,) their rows.    num_observations: (B,).    num_own: q, columns of N.
+    offset: (B, 2) `affine_offset` of each.
+    """
+
+    def __init__(self, source: ModelSums, images: list[int]) -> None:
+        self.images = images
+        cameras = [source.camera(image) for image in images]
+        self.offset = np.array([affine_offset(camera) for camera in cameras])
+        self.num_own = 6 + len(fitted_param_idxs(cameras[0].model))
+        self.num_observations = np.array([source.num_of(image) for image in images], dtype=np.int64)
+        self._source = source
+        self._window = source.window(images, cameras) if kernels_in_use() and self.num_own <= MAX_OWN else None
+
+    @cached_property
+    def _features(self) -> list[ImageFeatures]:
+        return [self._source.features(image) for image in self.images]
+
+    def sums(self) -> tuple[FloatArray, FloatArray]:
+        """Return `sums_of` each image: (B, q + 40, q + 40) and (B, q + 40)."""
+        if self._window is not None and (found := misfit_sums(self._source.observed, self._window)) is not None:
+            return found
+        own = [sums_of(features) for features in self._features]
+        return np.stack([gram for gram, _ in own]), np.stack([on_y for _, on_y in own])
+
+    def meat(self, basis: FloatArray, on_y: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the meat (B, q + 40, q + 40) of N and features, largest leverages and numbers of clusters (B,).
+
+        Parameters
+        ----------
+        basis : (B, q, q) basis N is orthonormal        on_y : (B, q) what N explains of the residuals
+
+        Notes
+        -----
+        Observations whose keypoints lie in one pixel are one cluster; -1 clusters where the keypoints are out of range.
+        """
+        if self._window is not None:
+            found = misfit_meat(self._source.observed, self._window, basis, on_y)
+            if found is not None:
+                return found
+        size = self.num_own + NUM_FEATURES
+        meat, leverage = np.zeros((len(self.images), size, size)), np.zeros(len(self.images))
+        num_clusters = self.num_observations.copy()
+        for b, features in enumerate(self._features):
+            weights, leverage[b] = weights_of(features, basis[b], on_y[b])
+            g = scores_of(features, weights)
+            clusters = Clusters.of(coincident_keypoints(self._source.keypoints(self.images[b])))
+            if clusters is not None:
+                num_clusters[b] -= clusters.num_merged
+                clusters.merge(g)
+            meat[b] = g @ g.T
+        return meat, leverage, num_clusters
+
+    def add_tracks(
+        self, per_track: FloatArray, profile: tuple[FloatArray, FloatArray, FloatArray], tracks: Tracks
+    ) -> None:
+        """Add what the observations say to their tracks (last - first, 40), in place.
+
+        Parameters
+        ----------
+        profile : basis (B, r, q), on_y (B, q), coefficients (B, q, 40): features - N coefficients are off N
+        """
+        if self._window is not None:
+            found = misfit_tracks(self._source.observed, self._window, profile, tracks, per_track)
+            if found:
+                return
+        last_row = np.empty(len(per_track), dtype=np.int64)
+        for b, features in enumerate(self._features):
+            basis, on_y, coefficients = (each[b] for each in profile)
+            weights, _ = weights_of(features, basis, on_y)
+            g = scores_of(features, weights)
+            own = g[self.num_own :] - coefficients.T @ g[: self.num_own]
+            track = tracks.of_point[self._source.points(self.images[b])]
+            inside = (track >= tracks.first) & (track < tracks.last)
+            add_rows(per_track, track[inside] - tracks.first, own.T[inside], last_row)

@@ -1,0 +1,275 @@
+"""Misfit tests of many images at once: sums in C are those of numpy, and tests from sums those of one image alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from misfit_reference import PARAMS
+from model_writer import Camera, Image, Model, Point, write_binary
+from numpy.testing import assert_allclose
+
+from sfm_audit import open_model
+from sfm_audit.audit.cameras import project
+from sfm_audit.audit.inliers.projected import image_inliers
+from sfm_audit.audit.inliers.residuals import model_residuals
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, misfit_sums
+from sfm_audit.audit.misfit import (
+    GROUPS,
+    MisfitStatus,
+    candidate_fields,
+    coincident_keypoints,
+    nuisance_columns,
+    prepare,
+)
+from sfm_audit.audit.misfit.features import affine_offset, image_features, sums_of, widened, widened_columns
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.audit.misfit.images import misfit_of_images
+from sfm_audit.audit.misfit.outcome import judged_by_f
+from sfm_audit.audit.misfit.stacked import Sizes, judged_by_f_together, profiled, ranks_of
+from sfm_audit.audit.misfit.sums import ModelSums
+from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import moved
+
+compiled = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels")
+LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "EUCM")
+LENSES = (*LENSES, "RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE", "DIVISION")
+SURE = LENSES[:3]
+NUMBERS = (300, 130, 65)
+_SIZE = (640, 480)
+
+
+def model_of(folder, name, numbers=NUMBERS, *, seed=1, sigma=0.5, shared=False, twins=0, centre=(317.0, 243.5)):
+    """A model of images with so many points each; of ``twins`` points the keypoint is that of the point before."""
+    rng = np.random.default_rng(seed)
+    lens = BY_NAME[name]
+    params = np.array([*(500.0, 502.0)[: len(lens.focal_idxs)], *centre, *PARAMS[name]])
+    xyz = rng.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 9.0), (max(numbers), 3))
+    images, tracks = [], [[] for _ in xyz]
+    for k, number in enumerate(numbers):
+        quat = np.array([1.0, *rng.normal(0.0, 0.02, 3)]) * (1.0 + 0.01 * k)  # no unit quaternion, as stored
+        shift = np.array([0.3 - 0.3 * k, 0.1 * k, 0.0])
+        xy = project(lens, params, moved(quat, shift, xyz)) + rng.normal(0.0, sigma, (len(xyz), 2))
+        xy[1 : 2 * twins : 2] = np.floor(xy[0 : 2 * twins : 2]) + 0.5
+        seen = np.sort(rng.permutation(len(xyz))[:number])
+        points2d = tuple((float(x), float(y), int(p) + 1) for (x, y), p in zip(xy[seen], seen, strict=True))
+        for row, point in enumerate(seen.tolist()):
+            tracks[point].append((k + 1, row))
+        pose = (*map(float, quat), *map(float, shift))
+        images.append(Image(k + 1, f"{k}.jpg", points2d, pose, 1 if shared else k + 1))
+    cameras = [Camera(k + 1, lens.model_id, *_SIZE, tuple(map(float, params))) for k in range(len(numbers))]
+    points = [
+        Point(k + 1, tuple(own), tuple(map(float, at)), 0.5)
+        for k, (own, at) in enumerate(zip(tracks, xyz, strict=True))
+    ]
+    written = Model(tuple(cameras[: 1 if shared else len(cameras)]), tuple(images), tuple(points))
+    model = open_model(write_binary(folder, written))
+    return model, model_residuals(model)
+
+
+def window_of(model, residuals, images=None):
+    source = ModelSums(model, residuals)
+    (window,) = source.windows(list(range(len(model.images))) if images is None else images)
+    return window
+
+
+def assert_close(found, expected, rtol=1e-9):
+    scale = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), keepdims=True)
+    assert np.abs((found - expected) / scale).max() < rtol
+
+
+@compiled
+@pytest.mark.parametrize("name", LENSES)
+def test_sums_are_those_of_numpy(tmp_path, name):
+    model, residuals = model_of(tmp_path, name, twins=20)
+    window = window_of(model, residuals)
+    (gram, on_y) = window.sums()
+    found = profiled(
+        widened(gram, window.offset, window.num_own),
+        widened_columns(on_y, window.offset, window.num_own),
+        window.num_own,
+    )
+    meat, leverage, num_clusters = window.meat(found.to_basis, found.on_y)
+    with numpy_only():
+        plain = window_of(model, residuals)
+        plain_gram, plain_on_y = plain.sums()
+        plain_meat, plain_leverage, plain_clusters = plain.meat(found.to_basis, found.on_y)
+    root = np.sqrt(np.einsum("bii->bi", plain_gram))
+    assert_close(gram / root[:, :, None] / root[:, None, :], plain_gram / root[:, :, None] / root[:, None, :])
+    assert_close(on_y / root, plain_on_y / root)
+    root = np.sqrt(np.einsum("bii->bi", plain_meat))
+    both = [each / root[:, :, None] / root[:, None, :] for each in (meat, plain_meat)]
+    used = both[0] != 0.0
+    assert used[:, : window.num_own].all()
+    assert_close(both[0], np.where(used, both[1], 0.0))
+    assert_allclose(leverage, plain_leverage, rtol=1e-9)
+    assert num_clusters.tolist() == plain_clusters.tolist()
+    assert NUMBERS[0] - 26 < num_clusters[0] <= NUMBERS[0] - 20
+
+
+@pytest.mark.parametrize("path", [pytest.param("compiled", marks=compiled), "numpy"])
+@pytest.mark.parametrize("name", LENSES)
+def test_tests_from_sums_are_those_of_one_image_alone(tmp_path, name, path):
+    model, residuals = model_of(tmp_path, name, twins=20, seed=2)
+    if path == "numpy":
+        with numpy_only():
+            found = misfit_of_images(model, residuals, range(len(NUMBERS)))
+    else:
+        found = misfit_of_images(model, residuals, range(len(NUMBERS)))
+    assert 0 in found or name not in SURE
+    for image, own in found.items():
+        nuisance, expected = alone(model, residuals, image)
+        flat = nuisance.reshape(len(nuisance), -1)
+        assert_allclose(own.gram, flat @ flat.T, rtol=1e-9, atol=1e-9 * np.abs(flat @ flat.T).max())
+        assert_same(own.tests, expected)
+
+
+def alone(model, residuals, image):
+    own = image_inliers(model, residuals, image)
+    projected = own.projected
+    nuisance = nuisance_columns(own.camera.model, projected)
+    prepared = prepare(nuisance, candidate_fields(own.camera, projected), clusters=coincident_keypoints(own.xy_px))
+    return nuisance, prepared.test(own.residuals_px)
+
+
+def assert_same(found, expected):
+    assert tuple(found) == GROUPS
+    for group in GROUPS:
+        test, other = found[group], expected[group]
+        assert (test.rank, test.status) == (other.rank, other.status), group
+        if test.status is MisfitStatus.TESTED:
+            assert_allclose(test.p, other.p, rtol=5e-6, err_msg=group)
+            assert_allclose(test.px, other.px, rtol=5e-6, atol=1e-8, err_msg=group)
+
+
+def test_features_span_the_candidate_fields(tmp_path):
+    """Fields in the units of the sums are candidate fields times a number."""
+    model, residuals = model_of(tmp_path, "OPENCV", (200,))
+    own = image_inliers(model, residuals, 0)
+    fields = candidate_fields(own.camera, own.projected).reshape(42, -1)
+    gram, _ = sums_of(image_features(own.camera, own.projected, own.residuals_px))
+    q = len(gram) - NUM_FEATURES
+    found = widened(gram[None], np.array([affine_offset(own.camera)]), q)[0, q:, q:]
+    root = np.sqrt(np.diagonal(found))
+    length = np.linalg.norm(fields, axis=1)
+    for columns in GROUP_COLUMNS.values():
+        unit = found[columns, columns] / root[columns] / root[columns, None]
+        expected = fields[columns] @ fields[columns].T / length[columns] / length[columns, None]
+        assert_allclose(unit, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1e9])
+def test_the_unit_of_the_world_does_not_matter(tmp_path, scale):
+    model, residuals = model_of(tmp_path / "1", "SIMPLE_RADIAL", (120, 90))
+    images = dataclasses.replace(
+        model.images, translation_cam_from_world=scale * model.images.translation_cam_from_world
+    )
+    points = dataclasses.replace(model.points, xyz_world=scale * model.points.xyz_world)
+    other = dataclasses.replace(model, images=images, points=points)
+    found = misfit_of_images(other, model_residuals(other), [0, 1])
+    expected = misfit_of_images(model, residuals, [0, 1])
+    assert sorted(found) == [0, 1]
+    for image, own in found.items():
+        assert_same(own.tests, expected[image].tests)
+
+
+def test_images_in_doubt_are_left_out(tmp_path):
+    """With next to no distortion its column almost is a polynomial of the predicted point, which is a smooth field."""
+    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (200, 150), centre=(320.0, 240.0))
+    params = model.cameras.params.copy()
+    params[3::4] = 1e-5
+    flat = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
+    assert len(misfit_of_images(model, residuals, [0, 1])) == 2
+    assert not misfit_of_images(flat, model_residuals(flat), [0, 1])
+
+
+def test_panoramas_and_empty_images_have_no_sums(tmp_path):
+    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (100, 0))
+    assert list(misfit_of_images(model, residuals, [0, 1])) == [0]
+    assert not misfit_of_images(model, residuals, [])
+
+
+def test_few_points_are_not_enough_evidence(tmp_path):
+    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (300, *range(1, 30, 3)))
+    found = misfit_of_images(model, residuals, range(len(model.images)))
+    assert max(found) > 5
+    for image, own in found.items():
+        assert_same(own.tests, alone(model, residuals, image)[1])
+
+
+@compiled
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300, 5e-324, 1e17])
+def test_numbers_out_of_range_are_left_to_numpy(tmp_path, value):
+    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (100, 80))
+    for field in ("residuals_px", "point_jacobian"):
+        array = getattr(residuals, field).copy()
+        array[0, ..., 3] = value
+        odd = dataclasses.replace(residuals, **{field: array})
+        found = misfit_of_images(model, odd, [0, 1])
+        with numpy_only():
+            assert sorted(misfit_of_images(model, odd, [0, 1])) == sorted(found)
+        assert 1 in found
+        if not math.isfinite(value):
+            assert 0 not in found
+
+
+@compiled
+def test_the_kernel_takes_no_other_arrays(tmp_path):
+    model, residuals = model_of(tmp_path, "OPENCV", (100, 80))
+    source = ModelSums(model, residuals)
+    cameras = [source.camera(0), source.camera(1)]
+    window = source.window([0, 1], cameras)
+    observed = source.observed
+    assert misfit_sums(observed, window) is not None
+    for changed in (
+        {"rows": window.rows + 100},
+        {"rows": window.rows[:, ::-1].copy()},
+        {"numbers": window.numbers[:, 1:].copy()},
+        {"facts": np.array([4, 2, 0, 4, -1, -1, -1])},
+        {"d_extra": (window.d_extra[0], window.d_extra[0])},
+    ):
+        with pytest.raises(ValueError, match=r"of shape|not there"):
+            misfit_sums(observed, window._replace(**changed))
+    point_idx = observed.point_idx.copy()
+    point_idx[5] = len(observed.xyz_world)
+    with pytest.raises(ValueError, match="row"):
+        dataclasses.replace(observed, point_idx=point_idx)
+    with pytest.raises(ValueError, match="lengths"):
+        dataclasses.replace(observed, residuals_px=observed.residuals_px[:, 1:])
+    wide = np.zeros((2, 400))[:, ::2]
+    taken = Observed.of(
+        observed.xyz_world,
+        observed.xy_px,
+        (observed.point_idx.astype(np.int32), observed.observation_row),
+        wide[:, : len(observed.point_idx)],
+        observed.point_jacobian,
+    )
+    assert taken.point_idx.dtype == np.int64
+    assert misfit_sums(taken, window) is not None
+
+
+def test_ranks_are_certain_only_with_digits():
+    values = np.array([[1e-14, 0.5], [1e-12, 0.5], [1e-8, 0.5], [0.3, 0.5]])
+    along = np.zeros((4, 3, 2))
+    along[3, 0, 1] = 1e10
+    ranks, certain = ranks_of(values, along)
+    assert ranks.tolist() == [1, 2, 2, 2]
+    assert certain.tolist() == [True, False, True, False]
+
+
+def test_groups_judged_together_are_judged_as_alone():
+    rng = np.random.default_rng(3)
+    g = rng.standard_normal((5, 3, 40))
+    g[2, 1] = g[2, 0]  # a singular meat is in doubt
+    scores, meat = g.sum(axis=2), g @ g.swapaxes(1, 2)
+    sizes = Sizes(np.full(5, 40), np.array([40, 39, 38, 37, 36]))
+    found = judged_by_f_together(scores, meat, sizes)
+    assert found[2] is None
+    for b in (0, 1, 3, 4):
+        (expected,) = judged_by_f(scores[b], meat[b], [3], int(sizes.num_clusters[b]), 40)
+        assert found[b] is not None
+        assert_allclose(found[b][:2], expected[:2], rtol=1e-9)
+        assert found[b][2:] == expected[2:]
