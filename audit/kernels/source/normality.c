@@ -104,8 +104,8 @@ static void sort(int64_t n, const double *x, Room *room)
 INLINE void assign(Lanes cdf, int64_t n, int64_t used, int32_t *bucket)
 {
     for (int l = 0; l < used; l++) {
-        const int32_t b = (int32_t)(cdf[l] * (double)n);
-        bucket[l] = b < 0 ? 0 : b >= n ? (int32_t)n - 1 : b;
+        const double at = cdf[l] * (double)n;
+        bucket[l] = !(at > 0.0) ? 0 : at >= (double)n ? (int32_t)n - 1 : (int32_t)at; /* NaN: the first */
     }
 }
 
