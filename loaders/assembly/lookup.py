@@ -6,12 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import IntArray, UInt64Array
+from sfm_audit.loaders.arrays import IntArray, UInt32Array, UInt64Array
 
 _MAX_TABLE_PER_ID: Final = 16
 
 
-def rows_of(sorted_ids: UInt64Array, ids: UInt64Array) -> IntArray:
+def rows_of(sorted_ids: UInt64Array, ids: UInt64Array | UInt32Array) -> IntArray:
     """Return the row of each of ``ids`` in ``sorted_ids``, -1 where it is not there."""
     if len(sorted_ids) == 0:
         return np.full(len(ids), -1, dtype=np.int64)
@@ -19,7 +19,8 @@ def rows_of(sorted_ids: UInt64Array, ids: UInt64Array) -> IntArray:
     if size <= _MAX_TABLE_PER_ID * len(sorted_ids):  # dense ids: a table is faster than a search
         table = np.full(size + 1, -1, dtype=np.int32)
         table[sorted_ids] = np.arange(len(sorted_ids), dtype=np.int32)
-        return table[np.minimum(ids, np.uint64(size))].astype(np.int64)
+        largest = ids.dtype.type(min(size, int(np.iinfo(ids.dtype).max)))
+        return table.take(np.minimum(ids, largest), mode="clip").astype(np.int64)
     rows = np.searchsorted(sorted_ids, ids)
     rows[rows == len(sorted_ids)] = 0
     return np.where(sorted_ids[rows] == ids, rows, -1).astype(np.int64)

@@ -21,6 +21,8 @@ Sensor = tuple[int, int]
 CAMERA_SENSOR: Final = 0
 IDENTITY_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Pose = tuple[float, ...]
+_MOST_AT_ONCE: Final = 1 << 21  # 2D points for which memory is asked; more are put together afterwards
+_Linked = tuple[IntArray, FloatArray, UInt64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,10 +137,59 @@ def camera_table(cameras: Sequence[RawCamera]) -> CameraTable:
     )
 
 
-def image_columns(images: Sequence[RawImage]) -> RawImages:
-    """Return the images as columns, sorted by id."""
+class LinkedPoints:
+    """The linked 2D points of all images, one image behind the other; memory is touched where something is written.
+
+    Parameters
+    ----------
+    capacity : how many there can be, as far as the size of a file says
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._full: list[_Linked] = []
+        self._open = _no_linked(min(capacity, _MOST_AT_ONCE))
+        self._num = 0
+
+    def add(self, fields: UInt64Array) -> _Linked:
+        """Take an image's POINTS2D (n, 3), bits of x, y and the point's id; return what is kept of the linked ones."""
+        chosen = np.flatnonzero(fields[:, 2] != UNLINKED)
+        linked = fields if len(chosen) == len(fields) else fields[chosen]
+        if self._num + len(chosen) > len(self._open[0]):
+            self._full.append(self._written)
+            self._open, self._num = _no_linked(max(len(chosen), _MOST_AT_ONCE)), 0
+        own = slice(self._num, self._num + len(chosen))
+        self._num = own.stop
+        point2d_idx, xy_px, point3d_id = self._open[0][own], self._open[1][own], self._open[2][own]
+        point2d_idx[:], xy_px.view(np.uint64)[:], point3d_id[:] = chosen, linked[:, :2], linked[:, 2]
+        return point2d_idx, xy_px, point3d_id
+
+    @property
+    def _written(self) -> _Linked:
+        point2d_idx, xy_px, point3d_id = self._open
+        return point2d_idx[: self._num], xy_px[: self._num], point3d_id[: self._num]
+
+    def columns(self) -> _Linked:
+        """Positions in POINTS2D, px and ids of the points, of all images in the order in which they came."""
+        if not self._full:
+            return self._written
+        point2d_idx, xy_px, point3d_id = zip(*self._full, self._written, strict=True)
+        return np.concatenate(point2d_idx), np.concatenate(xy_px), np.concatenate(point3d_id)
+
+
+def _no_linked(capacity: int) -> _Linked:
+    return np.empty(capacity, np.int64), np.empty((capacity, 2)), np.empty(capacity, np.uint64)
+
+
+def image_columns(images: Sequence[RawImage], linked: LinkedPoints | None = None) -> RawImages:
+    """Return the images as columns, sorted by id; ``linked`` holds their 2D points, in the order of ``images``."""
     rows = sorted(images, key=lambda image: image.image_id)
-    no_ids, no_xy, no_idx = np.empty(0, np.uint64), np.empty((0, 2)), np.empty(0, np.int64)
+    if linked is not None and all(row is image for row, image in zip(rows, images, strict=True)):
+        point2d_idx, xy_px, point3d_id = linked.columns()
+    else:
+        no_ids, no_xy, no_idx = np.empty(0, np.uint64), np.empty((0, 2)), np.empty(0, np.int64)
+        point2d_idx = np.concatenate([no_idx, *(row.point2d_idx for row in rows)])
+        xy_px = np.concatenate([no_xy, *(row.xy_px for row in rows)])
+        point3d_id = np.concatenate([no_ids, *(row.point3d_id for row in rows)])
     return RawImages(
         image_id=np.array([row.image_id for row in rows], dtype=np.uint32),
         name=tuple(row.name for row in rows),
@@ -146,9 +197,9 @@ def image_columns(images: Sequence[RawImage]) -> RawImages:
         poses=np.array([row.pose for row in rows], dtype=np.float64).reshape(-1, 7),
         num_points2d=np.array([row.num_points2d for row in rows], dtype=np.int64),
         offsets=offsets_of([len(row.point3d_id) for row in rows]),
-        point2d_idx=np.concatenate([no_idx, *(row.point2d_idx for row in rows)]),
-        xy_px=np.concatenate([no_xy, *(row.xy_px for row in rows)]),
-        point3d_id=np.concatenate([no_ids, *(row.point3d_id for row in rows)]),
+        point2d_idx=point2d_idx,
+        xy_px=xy_px,
+        point3d_id=point3d_id,
         num_unused_nonfinite=sum(row.num_unused_nonfinite for row in rows),
     )
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sfm_audit.loaders.arrays import IntArray, UInt64Array
+from sfm_audit.loaders.arrays import BoolArray, IntArray, UInt64Array
 from sfm_audit.loaders.assembly.lookup import rows_of
 from sfm_audit.loaders.assembly.raw import RawPoints, offsets_of
 from sfm_audit.loaders.model import Finding, FindingCode, ObservationTable, SparseModel
@@ -31,7 +31,7 @@ class TrackDifference:
 
 def find_track_inconsistencies(model: SparseModel, points: RawPoints) -> tuple[Finding, ...]:
     """Return the findings about links, tracks, and the points that they share."""
-    num_links = np.bincount(model.observations.point_idx + 1, minlength=len(model.points) + 1)[1:]
+    num_links = _num_links(model)
     checks = (
         _tracks_disagree(model, points) if points.has_tracks else None,
         _dangling(model),
@@ -42,29 +42,38 @@ def find_track_inconsistencies(model: SparseModel, points: RawPoints) -> tuple[F
     return tuple(finding for finding in checks if finding)
 
 
+def _num_links(model: SparseModel) -> IntArray:
+    """(P,) observations of each point."""
+    point_idx = model.observations.point_idx
+    is_known = point_idx >= 0
+    known = point_idx if is_known.all() else point_idx[is_known]
+    return np.bincount(known, minlength=len(model.points))
+
+
 def compare_tracks(model: SparseModel, points: RawPoints) -> TrackDifference:
     """Compare the sets of (image, POINT2D index, point) of the images and of the tracks."""
     images, observations = model.images, model.observations
     first_point2d = offsets_of(images.num_points2d)
-    row_at = _rows_by_position(observations, first_point2d)
-    point_of_row = np.append(observations.point_idx, -1)  # row -1: no observation there
-    rank = np.empty(len(points.order), dtype=np.int64)
-    rank[points.order] = np.arange(len(points.order))
+    point_at = _points_by_position(observations, first_point2d)
+    nowhere = len(point_at) - 1
+    rank = np.empty(len(points.order), dtype=np.int32)
+    rank[points.order] = np.arange(len(points.order), dtype=np.int32)
     track_point_idx = np.repeat(rank, points.track_lengths)
-    image_ids = images.image_id.astype(np.uint64)
+    image_ids, end_point2d = images.image_id.astype(np.uint64), np.append(first_point2d[1:], 0)  # 0: of no image
 
-    has_track = observations.point_idx < 0
+    is_in_track = np.zeros(len(point_at), dtype=np.bool_)
     loose: list[IntArray] = []
     for start in range(0, len(track_point_idx), _CHUNK):
         chunk = slice(start, start + _CHUNK)
-        image_idx = rows_of(image_ids, points.track_image_id[chunk].astype(np.uint64))
-        point2d_idx = points.track_point2d_idx[chunk]
-        exists = image_idx >= 0
-        exists[exists] = point2d_idx[exists] < images.num_points2d[image_idx[exists]]
-        row = row_at[np.where(exists, first_point2d[image_idx] + point2d_idx, -1)]
-        is_confirmed = point_of_row[row] == track_point_idx[chunk]
-        has_track[row[is_confirmed]] = True
-        loose.append(start + np.flatnonzero(~is_confirmed))
+        image_idx = rows_of(image_ids, points.track_image_id[chunk])
+        position = first_point2d.take(image_idx, mode="wrap") + points.track_point2d_idx[chunk]
+        position[position >= end_point2d.take(image_idx, mode="wrap")] = nowhere
+        is_confirmed = point_at.take(position) == track_point_idx[chunk]
+        if is_confirmed.all():
+            is_in_track[position] = True
+        else:
+            is_in_track[position[is_confirmed]] = True
+            loose.append(start + np.flatnonzero(~is_confirmed))
     elements = np.concatenate([np.empty(0, np.int64), *loose])
     only_in_tracks = np.column_stack(
         [
@@ -73,7 +82,15 @@ def compare_tracks(model: SparseModel, points: RawPoints) -> TrackDifference:
             model.points.point3d_id[track_point_idx[elements]],
         ]
     )
-    return TrackDifference(np.flatnonzero(~has_track), _unique_rows(only_in_tracks))
+    return TrackDifference(_only_in_images(observations, first_point2d, is_in_track), _unique_rows(only_in_tracks))
+
+
+def _only_in_images(observations: ObservationTable, first_point2d: IntArray, is_in_track: BoolArray) -> IntArray:
+    """Rows of the observations with a point that are in no track, given which positions of all POINTS2D are in one."""
+    if int(np.count_nonzero(is_in_track)) == int(np.count_nonzero(observations.point_idx >= 0)):
+        return np.empty(0, dtype=np.int64)  # a position is in a track only where an observation has a point
+    position = np.repeat(first_point2d[:-1], np.diff(observations.offsets)) + observations.point2d_idx
+    return np.flatnonzero(~is_in_track[position] & (observations.point_idx >= 0))
 
 
 def _unique_rows(rows: UInt64Array) -> UInt64Array:
@@ -84,12 +101,13 @@ def _unique_rows(rows: UInt64Array) -> UInt64Array:
     return rows[is_new]
 
 
-def _rows_by_position(observations: ObservationTable, first_point2d: IntArray) -> npt.NDArray[np.int32]:
-    """Return the row of the observation at each place of all POINTS2D, -1 where nothing is linked, and last of all."""
-    row_at = np.full(int(first_point2d[-1]) + 1, -1, dtype=np.int32)
+def _points_by_position(observations: ObservationTable, first_point2d: IntArray) -> npt.NDArray[np.int32]:
+    """Return the row of the point at each place of all POINTS2D, -1 where none is linked, and last of all."""
+    point_at = np.full(int(first_point2d[-1]) + 1, -1, dtype=np.int32)
     for image_idx, (first, last) in enumerate(pairwise(observations.offsets.tolist())):
-        row_at[first_point2d[image_idx] + observations.point2d_idx[first:last]] = np.arange(first, last, dtype=np.int32)
-    return row_at
+        own = point_at[first_point2d[image_idx] : first_point2d[image_idx + 1]]
+        own[observations.point2d_idx[first:last]] = observations.point_idx[first:last]
+    return point_at
 
 
 def _tracks_disagree(model: SparseModel, points: RawPoints) -> Finding | None:
@@ -135,6 +153,8 @@ def _points_with(model: SparseModel, is_wrong: np.ndarray, code: FindingCode, wh
 def _repeated(model: SparseModel) -> Finding | None:
     """Count 2D points beyond the first that link to the same 3D point in the same image."""
     observations = model.observations
+    if not _any_repeated(model):
+        return None
     num_points = max(len(model.points), 1)
     key = np.repeat(np.arange(len(model.images), dtype=np.int64) * num_points, np.diff(observations.offsets))
     key += observations.point_idx
@@ -146,3 +166,17 @@ def _repeated(model: SparseModel) -> Finding | None:
     example = f"e.g. point {model.points.point3d_id[point]} in image {model.images.image_id[image]}"
     text = f"{len(repeated)} linked 2D points repeat a 3D point that their image has linked already, {example}"
     return Finding(FindingCode.REPEATED_OBSERVATIONS, len(repeated), text)
+
+
+def _any_repeated(model: SparseModel) -> bool:
+    """Whether an image links to a point twice, or perhaps only to points that do not exist: no order is needed."""
+    observations = model.observations
+    last_at = np.empty(len(model.points) + 1, dtype=np.int32)  # row -1: dangling
+    bounds = observations.offsets.tolist()
+    positions = np.arange(max((last - first for first, last in pairwise(bounds)), default=0), dtype=np.int32)
+    for first, last in pairwise(bounds):
+        own, position = observations.point_idx[first:last], positions[: last - first]
+        last_at[own] = position
+        if (last_at[own] != position).any():
+            return True
+    return False

@@ -15,7 +15,7 @@ import numpy as np
 from sfm_audit.loaders.assembly.raw import (
     CAMERA_SENSOR,
     IDENTITY_POSE,
-    UNLINKED,
+    LinkedPoints,
     Pose,
     RawCamera,
     RawFrame,
@@ -90,14 +90,15 @@ def read_images(path: InputPath) -> RawImages:
         count = num_images(path, file.read(COUNT.size), size)
         images: dict[int, RawImage] = {}
         offset = COUNT.size
+        linked = LinkedPoints(max(0, size - offset - count * (_IMAGE.size + COUNT.size)) // _POINT2D_SIZE)
         for _ in range(count):
-            image, end = _read_image(file, path, offset, size)
+            image, end = _read_image(file, path, (offset, size), linked)
             if image.image_id in images:
                 raise duplicate_id(path, Position("byte", offset), "image", image.image_id)
             images[image.image_id] = image
             offset = end
     check_end(path, offset, size, "images")
-    return image_columns(list(images.values()))
+    return image_columns(list(images.values()), linked)
 
 
 def num_images(path: InputPath, head: bytes, size: int) -> int:
@@ -137,26 +138,18 @@ def _read_image_head(
     return fields, name, int(num_points2d), offset + COUNT.size
 
 
-def _read_image(file: BufferedReader, path: InputPath, start: int, size: int) -> tuple[RawImage, int]:
-    """Read the image whose record begins at ``start``; return it and where its record ends."""
+def _read_image(
+    file: BufferedReader, path: InputPath, place: tuple[int, int], linked: LinkedPoints
+) -> tuple[RawImage, int]:
+    """Read the image whose record begins at ``place[0]`` of a file of ``place[1]`` bytes; return where it ends too."""
+    start, size = place
     (image_id, *pose, camera_id), name, num_points2d, offset = _read_image_head(file, path, start, size)
     data = file.read(_POINT2D_SIZE * num_points2d)
     if len(data) < _POINT2D_SIZE * num_points2d:  # the file shrank while it was read
         what = f"the 2D points of image {image_id}"
         raise truncated(path, offset, what, _POINT2D_SIZE * num_points2d, len(data))
     fields = np.frombuffer(data, dtype="<u8").reshape(-1, 3)
-    point2d_idx = np.flatnonzero(fields[:, 2] != UNLINKED)
-    linked = fields[point2d_idx]
-    image = RawImage(
-        image_id,
-        tuple(pose),
-        camera_id,
-        name,
-        num_points2d,
-        point2d_idx,
-        np.ascontiguousarray(linked[:, :2]).view("<f8"),
-        np.ascontiguousarray(linked[:, 2]),
-    )
+    image = RawImage(image_id, tuple(pose), camera_id, name, num_points2d, *linked.add(fields))
     return image, offset + len(data)
 
 

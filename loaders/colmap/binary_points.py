@@ -21,7 +21,10 @@ _POINT3D: Final = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
 )
 _TRACK_LENGTH_AT: Final = 43
-_PIECE_BYTES: Final = 1 << 25  # in memory at a time
+_SIZE_BY_BYTE: Final = tuple(_POINT3D.itemsize + 8 * length for length in range(256))
+_FEW: Final = 1 << 4  # records between two looks at their lengths, where long tracks are about
+_MANY: Final = 1 << 14  # and where none was seen
+_PIECE_BYTES: Final = 1 << 23  # in memory at a time
 _FIRST_BYTES: Final = 1 << 16  # of the first piece, in which most damage shows
 
 
@@ -97,17 +100,54 @@ def point_pieces(path: InputPath) -> Iterator[_Piece]:
 
 
 def _point_starts(data: bytes, max_count: int) -> tuple[list[int], int]:
-    """Return where whole records begin, ``max_count`` at most, and where the last ends: 51 + 8 * track length bytes."""
+    """Return where whole records begin, ``max_count`` at most, and where the last ends: 51 + 8 * track length bytes.
+
+    The length is taken from the first of its eight bytes, which is fast, and compared with all of them afterwards.
+    """
     starts: list[int] = []
-    offset, size = 0, len(data)
-    unpack = COUNT.unpack_from
-    while len(starts) < max_count and offset + _POINT3D.itemsize <= size:
-        end = offset + _POINT3D.itemsize + 8 * unpack(data, offset + _TRACK_LENGTH_AT)[0]
+    offset, size, num_at_once = 0, len(data), _FEW
+    while len(starts) < max_count:
+        found, after = _short_starts(data, offset, min(num_at_once, max_count - len(starts)))
+        starts += found
+        num_at_once = min(2 * num_at_once, _MANY) if len(found) == num_at_once else _FEW
+        if found and after <= size:
+            offset = after
+            continue
+        if found:  # the last one is not whole
+            return starts[:-1], starts[-1]
+        if offset + _POINT3D.itemsize > size:
+            break
+        end = offset + _POINT3D.itemsize + 8 * COUNT.unpack_from(data, offset + _TRACK_LENGTH_AT)[0]
         if end > size:
             break
         starts.append(offset)
         offset = end
     return starts, offset
+
+
+def _short_starts(data: bytes, offset: int, max_count: int) -> tuple[list[int], int]:
+    """Return where consecutive records from ``offset`` on begin, up to one whose track has 256 elements, and the end.
+
+    The last one need not be whole.
+    """
+    starts: list[int] = []
+    add, sizes, after = starts.append, _SIZE_BY_BYTE, offset
+    try:
+        for _ in range(max_count):
+            size = sizes[data[after + _TRACK_LENGTH_AT]]
+            add(after)
+            after += size
+    except IndexError:  # behind the end of the data
+        pass
+    while starts and starts[-1] + _POINT3D.itemsize > len(data):
+        after = starts.pop()
+    windows = np.ndarray((max(0, len(data) - 7),), "V8", data, strides=(1,))
+    lengths = windows[np.array(starts, dtype=np.int64) + _TRACK_LENGTH_AT].view("<u8")
+    is_long = np.flatnonzero(lengths > np.uint64(len(sizes) - 1))
+    if len(is_long):
+        after = starts[is_long[0]]
+        del starts[is_long[0] :]
+    return starts, after
 
 
 def _record_bytes(path: InputPath, data: bytes, at: int, place: tuple[int, int], size: int) -> int:
