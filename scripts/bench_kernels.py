@@ -24,6 +24,7 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.consistency import consistency_of
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
+from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.loaders import open_model
 from sfm_audit.loaders.model import SparseModel
@@ -48,10 +49,18 @@ def misfit(model: SparseModel) -> Callable[[], object]:
     return lambda: misfit_of_images(model, residuals, range(len(model.images)))
 
 
+def cameras(model: SparseModel) -> Callable[[], object]:
+    """Misfit tests of the first camera, pooled over its images."""
+    residuals = model_residuals(model)
+    images = np.flatnonzero(model.images.camera_idx == 0).tolist()
+    return lambda: camera_tests_of_sums(model, residuals, images)
+
+
 SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {
     "projection": projection,
     "consistency": consistency,
     "misfit": misfit,
+    "cameras": cameras,
 }
 """From a model to what is timed; what it needs of the model is made before."""
 

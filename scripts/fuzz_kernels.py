@@ -103,6 +103,8 @@ def audit_everything(rng: np.random.Generator, *, quick: bool) -> None:
             for shared in (k % 2 == 0,) if quick else (False, True):
                 model = models.lens_model(lens, rng, numbers, shared=shared)
                 _audit(models.writer.write_binary(place / f"{k}{shared}", model))
+        shared_model = models.lens_model(models.LENSES[2], rng, (120, 90, 70), shared=True)
+        _audit(models.writer.write_binary(place / "shared", shared_model))
         large = 40_000 if quick else 1_000_000
         _audit(
             models.writer.write_binary(

@@ -28,6 +28,7 @@ from sfm_audit.audit.misfit import (
     project_image,
     projected_design,
 )
+from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.design import Piece, piece_of
 from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, camera_tests_in_parts
 from sfm_audit.audit.misfit.pooled import camera_tests_of_pieces
@@ -109,6 +110,20 @@ class _CameraImages:
         """Inliers of the k-th image, or some of them."""
         return image_inliers(self.model, self.residuals, int(self.image_idxs[k]), chosen)
 
+    @property
+    def num_observations(self) -> int:
+        """Inliers of all images."""
+        return int(np.diff(self.residuals.offsets)[self.image_idxs].sum())
+
+    def num_points(self) -> int:
+        """Points that the images see."""
+        if 8 * self.num_observations < len(self.model.points):
+            return self.tracks()[1]
+        seen = np.zeros(len(self.model.points), dtype=np.bool_)
+        for image_idx in self.image_idxs.tolist():
+            seen[self.residuals.point_idx[self.residuals.rows(image_idx)]] = True
+        return int(np.count_nonzero(seen))
+
     def tracks(self) -> tuple[list[IntArray], int]:
         """Rows of each image's points in the list of this camera's points, and the length of that list."""
         parts = [self.residuals.point_idx[self.residuals.rows(int(i))] for i in self.image_idxs]
@@ -141,16 +156,12 @@ def audit_cameras(
     there but for points that the image sees twice. q: Benjamini-Hochberg over the model's cameras.
     """
     audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
-    groups = [
-        _CameraImages(model, residuals, model.camera(int(c)), audited[model.images.camera_idx[audited] == c])
-        for c in np.unique(model.images.camera_idx[audited])
-    ]
-    tracks = [group.tracks() for group in groups]
+    groups = _groups_of(model, residuals, audited)
     tests = [_pooled(group.only(holds), quality) for group in groups]
     significance = Significance.of(tests)
     out = []
-    for k, (group, (rows, num_points)) in enumerate(zip(groups, tracks, strict=True)):
-        num_observations = sum(part.size for part in rows)
+    for k, group in enumerate(groups):
+        num_observations = group.num_observations
         sigma, tau = float(np.median(sigma_px[group.image_idxs])), float(np.median(tau_px[group.image_idxs]))
         groups_of = misfit_groups(tests[k], significance.q[k], num_observations=num_observations, sigma_px=sigma)
         misfit = decide_misfit(groups_of, alpha=alpha, tau_px=tau)
@@ -158,13 +169,26 @@ def audit_cameras(
             group.camera,
             misfit.group if misfit.material else None,
             misfit.material,
-            retest=_retest(group, rows, num_points),
+            retest=_retest(group),
             distortion_identified=_distortion_identified([quality[int(i)] for i in group.image_idxs]),
             alpha=alpha,
             tau_px=tau,
         )
-        out.append(CameraAudit(group.camera, group.image_idxs, num_points, num_observations, tests[k], misfit, advice))
+        counts = group.num_points(), num_observations
+        out.append(CameraAudit(group.camera, group.image_idxs, *counts, tests[k], misfit, advice))
     return out
+
+
+def _groups_of(model: SparseModel, residuals: ModelResiduals, image_idxs: IntArray) -> list[_CameraImages]:
+    """Images by camera, in the order of the camera table."""
+    camera_idx = model.images.camera_idx[image_idxs]
+    by_camera = image_idxs[np.argsort(camera_idx, kind="stable")]
+    cameras, counts = np.unique(camera_idx, return_counts=True)
+    ends = np.cumsum(counts)
+    return [
+        _CameraImages(model, residuals, model.camera(camera), by_camera[end - count : end])
+        for camera, count, end in zip(cameras.tolist(), counts.tolist(), ends.tolist(), strict=True)
+    ]
 
 
 def _pooled(group: _CameraImages, quality: Sequence[CameraQuality | None]) -> MisfitTests:
@@ -174,17 +198,18 @@ def _pooled(group: _CameraImages, quality: Sequence[CameraQuality | None]) -> Mi
     own = quality[int(group.image_idxs[0])]
     if len(group.image_idxs) == 1 and own is not None:
         return own.misfit
-    return group.tests(group.camera, *group.tracks()).tests
+    found = camera_tests_of_sums(group.model, group.residuals, group.image_idxs.tolist())
+    return (group.tests(group.camera, *group.tracks()) if found is None else found).tests
 
 
-def _retest(group: _CameraImages, rows: Sequence[IntArray], num_points: int) -> Retest:
+def _retest(group: _CameraImages) -> Retest:
     """The geometry waits until it is asked, which happens to few cameras."""
 
     def retest(camera: CameraRecord) -> MisfitTests:
         if len(group.image_idxs) == 1:
             own = group.inliers(0)
             return image_retest(own.xyz_cam, own.residuals_px)(camera)
-        return group.tests(camera, rows, num_points).tests
+        return group.tests(camera, *group.tracks()).tests
 
     return retest
 

@@ -15,7 +15,22 @@ MAX_OWN: Final = 32
 """Columns of an image's own fit that the kernels have room for."""
 _DONE: Final = 0
 _Strided: Final = np.ctypeslib.ndpointer(np.float64)
-_WINDOW: Final = (Size, Ints, Doubles, Ints, Ints, Doubles, Ints, Doubles, Ints, _Strided, Size, _Strided, Size)
+_WINDOW: Final = (
+    Size,
+    Ints,
+    Doubles,
+    Doubles,
+    Ints,
+    Ints,
+    Doubles,
+    Ints,
+    Doubles,
+    Ints,
+    _Strided,
+    Size,
+    _Strided,
+    Size,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +107,7 @@ def misfit_sums(observed: Observed, window: Window) -> tuple[FloatArray, FloatAr
         return None
     size = window.num_own + NUM_FEATURES
     gram, on_y = np.empty((len(window.rows), size, size)), np.empty((len(window.rows), size))
-    kept, arguments = _arguments(observed, window)
-    status = function(*arguments, gram, on_y)
-    del kept
+    status = function(*_arguments(observed, window), gram, on_y)
     return (gram, on_y) if status == _DONE else None
 
 
@@ -117,9 +130,7 @@ def misfit_meat(
     _check("on_y", on_y, (num, q))
     meat, leverage = np.zeros((num, q + NUM_FEATURES, q + NUM_FEATURES)), np.zeros(num)
     num_clusters = np.zeros(num, dtype=np.int64)
-    kept, arguments = _arguments(observed, window)
-    status = function(*arguments, basis, on_y, meat, leverage, num_clusters)
-    del kept
+    status = function(*_arguments(observed, window), basis, on_y, meat, leverage, num_clusters)
     return (meat, leverage, num_clusters) if status == _DONE else None
 
 
@@ -154,16 +165,22 @@ def misfit_tracks(
     _check("coefficients", coefficients, (num, q, NUM_FEATURES))
     _check("tracks", tracks.of_point, (len(observed.xyz_world),))
     _check("per_track", per_track, (tracks.last - tracks.first, NUM_FEATURES))
-    kept, arguments = _arguments(observed, window)
     status = function(
-        *arguments, basis, basis.shape[1], on_y, coefficients, tracks.of_point, tracks.first, tracks.last, per_track
+        *_arguments(observed, window),
+        basis,
+        basis.shape[1],
+        on_y,
+        coefficients,
+        tracks.of_point,
+        tracks.first,
+        tracks.last,
+        per_track,
     )
-    del kept
     return status == _DONE
 
 
-def _arguments(observed: Observed, window: Window) -> tuple[object, tuple[object, ...]]:
-    """What has to stay alive during the call, and what all kernels here begin with."""
+def _arguments(observed: Observed, window: Window) -> tuple[object, ...]:
+    """What all kernels here begin with."""
     num, num_extra = len(window.rows), int(window.facts[0])
     _check("rows", window.rows, (num, 2))
     _check("numbers", window.numbers, (num, 22))
@@ -173,16 +190,18 @@ def _arguments(observed: Observed, window: Window) -> tuple[object, tuple[object
         raise ValueError("observations that are not there")
     if int(window.facts[3:].max(initial=-1)) >= num_extra:
         raise ValueError("distortion parameters that are not there")
-    kept = [np.ascontiguousarray(each, dtype=np.float64) for each in window.d_extra] if num_extra else []
-    for each, length in zip(kept, (stop - start).tolist(), strict=bool(num_extra)):
-        _check("d_extra", each, (num_extra, 2, length))
-    addresses = np.array([each.ctypes.data for each in kept] or [0] * num, dtype=np.int64)
+    extra, extra_offsets = np.empty(0), np.zeros(num, dtype=np.int64)
+    if num_extra:
+        for each, length in zip(window.d_extra, (stop - start).tolist(), strict=True):
+            _check("d_extra", each, (num_extra, 2, length))
+        extra, extra_offsets = _side_by_side(window.d_extra)
     residuals, jacobian = observed.residuals_px, observed.point_jacobian
-    return kept, (
+    return (
         num,
         window.rows,
         window.numbers,
-        addresses,
+        extra,
+        extra_offsets,
         window.facts,
         observed.xyz_world,
         observed.point_idx,
@@ -193,6 +212,17 @@ def _arguments(observed: Observed, window: Window) -> tuple[object, tuple[object
         jacobian,
         jacobian.strides[1] // 8,
     )
+
+
+def _side_by_side(arrays: tuple[FloatArray, ...]) -> tuple[FloatArray, IntArray]:
+    """One array (m,) that holds all of these, and where each begins: the one that all are views of, or a new one."""
+    base = arrays[0].base if arrays else None
+    if isinstance(base, np.ndarray) and base.ndim == 1 and base.dtype == np.float64 and base.flags.c_contiguous:
+        first = base.ctypes.data
+        if all(each.base is base and each.flags.c_contiguous for each in arrays):
+            return base, np.array([(each.ctypes.data - first) // 8 for each in arrays], dtype=np.int64)
+    sizes = np.array([each.size for each in arrays], dtype=np.int64)
+    return np.concatenate([np.ravel(each) for each in arrays] or [np.empty(0)]), np.cumsum(sizes) - sizes
 
 
 def _is_by_rows(array: FloatArray) -> bool:

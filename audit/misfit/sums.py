@@ -91,6 +91,13 @@ class ModelSums:
         """(n,) rows of the points that the image in this row sees."""
         return self._residuals.point_idx[self._residuals.rows(image)]
 
+    def tracks(self, images: Sequence[int]) -> tuple[IntArray, int]:
+        """Return the number of each point (P,) among those that these images see, -1 for others; how many they are."""
+        seen = np.zeros(len(self._model.points), dtype=np.bool_)
+        for image in images:
+            seen[self.points(image)] = True
+        return np.where(seen, np.cumsum(seen) - 1, -1).astype(np.int64), int(np.count_nonzero(seen))
+
     def can_sum(self, image: int) -> bool:
         """Whether the image in this row has fields, and room for its columns."""
         model, num = self.camera(image).model, self.num_of(image)

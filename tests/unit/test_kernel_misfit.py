@@ -16,15 +16,19 @@ from sfm_audit.audit.cameras import project
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, misfit_sums
+from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, Tracks, misfit_sums, misfit_tracks
 from sfm_audit.audit.misfit import (
     GROUPS,
     MisfitStatus,
+    camera_sums,
+    camera_tests,
     candidate_fields,
     coincident_keypoints,
     nuisance_columns,
     prepare,
+    projected_design,
 )
+from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.features import affine_offset, image_features, sums_of, widened, widened_columns
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
 from sfm_audit.audit.misfit.images import misfit_of_images
@@ -37,7 +41,7 @@ from sfm_audit.loaders.model import moved
 compiled = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels")
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "EUCM")
 LENSES = (*LENSES, "RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE", "DIVISION")
-SURE = LENSES[:3]
+SURE = LENSES[:3]  # of the others the smooth fields nearly are columns of the image's own fit
 NUMBERS = (300, 130, 65)
 _SIZE = (640, 480)
 
@@ -273,3 +277,67 @@ def test_groups_judged_together_are_judged_as_alone():
         assert found[b] is not None
         assert_allclose(found[b][:2], expected[:2], rtol=1e-9)
         assert found[b][2:] == expected[2:]
+
+
+def old_tests(model, residuals, images):
+    """The tests of a camera on images, one after the other, fields in memory."""
+    points = np.unique(residuals.point_idx, return_inverse=True)[1]
+
+    def design(k):
+        own = image_inliers(model, residuals, images[k])
+        return projected_design(own.camera, own.projected, own.residuals_px, points[residuals.rows(images[k])])
+
+    return camera_tests(design, len(images), int(points.max()) + 1)
+
+
+@pytest.mark.parametrize("path", [pytest.param("compiled", marks=compiled), "numpy"])
+@pytest.mark.parametrize("name", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "PINHOLE", "FOV", "DIVISION"])
+def test_a_shared_camera_is_tested_from_sums_as_from_its_columns(tmp_path, monkeypatch, name, path):
+    model, residuals = model_of(tmp_path, name, (300, 130, 65, 200), shared=True, twins=20)
+    monkeypatch.setattr(camera_sums, "_TRACKS_AT_ONCE", 70)
+    images = [0, 1, 3]
+    if path == "numpy":
+        with numpy_only():
+            found = camera_tests_of_sums(model, residuals, images)
+    else:
+        found = camera_tests_of_sums(model, residuals, images)
+    expected = old_tests(model, residuals, images)
+    assert found is not None
+    for counts in (found, expected):
+        assert (counts.num_images, counts.num_observations, counts.num_tracks) == (3, 630, 300)
+    assert {test.status for test in found.tests.values()} >= {MisfitStatus.TESTED}
+    assert_same(found.tests, expected.tests)
+
+
+def test_shared_cameras_in_doubt_are_left_out(tmp_path):
+    model, residuals = model_of(tmp_path / "few", "SIMPLE_RADIAL", (300, 2, 200), shared=True)
+    assert camera_tests_of_sums(model, residuals, [0, 1, 2]) is None
+    assert camera_tests_of_sums(model, residuals, [0, 2]) is not None
+    assert camera_tests_of_sums(model, residuals, []) is None
+    model, residuals = model_of(tmp_path / "small", "SIMPLE_RADIAL", (60, 60), shared=True)
+    assert camera_tests_of_sums(model, residuals, [0, 1]) is None
+    model, residuals = model_of(tmp_path / "flat", "SIMPLE_RADIAL", (200, 150), shared=True, centre=(320.0, 240.0))
+    params = model.cameras.params.copy()
+    params[3::4] = 1e-5
+    flat = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
+    assert camera_tests_of_sums(flat, model_residuals(flat), [0, 1]) is None
+
+
+@compiled
+def test_the_kernel_adds_to_no_track_that_is_not_asked_for(tmp_path):
+    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (100, 80), shared=True)
+    source = ModelSums(model, residuals)
+    window = source.window([0, 1], [source.camera(0)] * 2)
+    rng = np.random.default_rng(1)
+    profile = rng.normal(size=(2, 9, 8)) * 1e-4, rng.normal(size=(2, 8)) * 1e-4, rng.normal(size=(2, 8, NUM_FEATURES))
+    of_point, num_tracks = source.tracks([0, 1])
+    everything = np.zeros((num_tracks, NUM_FEATURES))
+    assert misfit_tracks(source.observed, window, profile, Tracks(of_point, 0, num_tracks), everything)
+    part = np.zeros((20, NUM_FEATURES))
+    assert misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 50), part)
+    assert (part == everything[30:50]).all()
+    assert (part != 0).any(axis=1).all()
+    with pytest.raises(ValueError, match="per_track"):
+        misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 51), part)
+    with pytest.raises(ValueError, match="tracks of shape"):
+        misfit_tracks(source.observed, window, profile, Tracks(of_point[1:], 30, 50), part)

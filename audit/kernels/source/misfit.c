@@ -271,17 +271,18 @@ static void write_sums(const sums_t *s, int q, double *gram, double *on_y) {
     for (int j = 0; j < MONOMIALS; ++j) on_y[along_y + j] = s->along_y[j * (MAX_OWN + 1) + q];
 }
 
-static image_t image_of(int64_t i, const int64_t *rows, const double *numbers, const int64_t *d_extra) {
-    const image_t image = {rows[2 * i], rows[2 * i + 1], numbers + NUM_NUMBERS * i, (const double *)(intptr_t)d_extra[i]};
-    return image;
-}
+/* What all kernels here begin with: images, whose observations are rows[2 i] .. rows[2 i + 1] - 1, and the model. */
+#define WINDOW                                                                                                         \
+    int64_t num_images, const int64_t *rows, const double *numbers, const double *extra, const int64_t *extra_offsets, \
+        const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,                      \
+        const int64_t *observation, const double *residuals, int64_t residual_stride, const double *jacobian,          \
+        int64_t jacobian_stride
+#define MODEL {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride}
+#define IMAGE(i) {rows[2 * (i)], rows[2 * (i) + 1], numbers + NUM_NUMBERS * (i), extra + extra_offsets[i]}
 
 /* First pass: Gram matrices of N and all features, and their products with the residuals. */
-KERNEL int64_t sfm_misfit_sums(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
-                               const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
-                               const int64_t *observation, const double *residuals, int64_t residual_stride,
-                               const double *jacobian, int64_t jacobian_stride, double *gram, double *on_y) {
-    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+KERNEL int64_t sfm_misfit_sums(WINDOW, double *gram, double *on_y) {
+    const model_t model = MODEL;
     const int q = own_columns(facts);
     const int64_t size = q + NUM_FEATURES;
     void *to_free;
@@ -291,7 +292,7 @@ KERNEL int64_t sfm_misfit_sums(int64_t num_images, const int64_t *rows, const do
         return block ? NEEDS_NUMPY : NO_MEMORY;
     }
     for (int64_t i = 0; i < num_images; ++i) {
-        const image_t image = image_of(i, rows, numbers, d_extra);
+        const image_t image = IMAGE(i);
         sums_t sums;
         memset(&sums, 0, sizeof sums);
         for (int64_t from = image.start; from < image.stop; from += SIZE) {
@@ -495,12 +496,8 @@ static void meat_of_clusters(const model_t *model, const image_t *image, const p
 }
 
 /* Second pass: the meat, observations of a pixel as one, and how many there are. leverage: the largest. */
-KERNEL int64_t sfm_misfit_meat(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
-                               const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
-                               const int64_t *observation, const double *residuals, int64_t residual_stride,
-                               const double *jacobian, int64_t jacobian_stride, const double *basis, const double *on_y,
-                               double *meat, double *leverage, int64_t *num_clusters) {
-    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+KERNEL int64_t sfm_misfit_meat(WINDOW, const double *basis, const double *on_y, double *meat, double *leverage, int64_t *num_clusters) {
+    const model_t model = MODEL;
     const int q = own_columns(facts);
     const int64_t size = q + NUM_FEATURES;
     int64_t longest = 1;
@@ -515,7 +512,7 @@ KERNEL int64_t sfm_misfit_meat(int64_t num_images, const int64_t *rows, const do
         return q > MAX_OWN ? NEEDS_NUMPY : NO_MEMORY;
     }
     for (int64_t i = 0; i < num_images; ++i) {
-        const image_t image = image_of(i, rows, numbers, d_extra);
+        const image_t image = IMAGE(i);
         const profile_t profile = {basis + i * q * q, on_y + i * q, q};
         meat_t sums;
         num_clusters[i] = -1;
@@ -541,13 +538,8 @@ static WIDE void project_scores(scores_t *s, int q, const double *coefficients) 
 }
 
 /* Second pass of images that share a camera: what each observation adds to its track, tracks first .. last - 1. */
-KERNEL int64_t sfm_misfit_tracks(int64_t num_images, const int64_t *rows, const double *numbers, const int64_t *d_extra,
-                                 const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,
-                                 const int64_t *observation, const double *residuals, int64_t residual_stride,
-                                 const double *jacobian, int64_t jacobian_stride, const double *basis, int64_t basis_rows,
-                                 const double *on_y, const double *coefficients, const int64_t *track_of_point,
-                                 int64_t first, int64_t last, double *per_track) {
-    const model_t model = {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride};
+KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows, const double *on_y, const double *coefficients, const int64_t *track_of_point, int64_t first, int64_t last, double *per_track) {
+    const model_t model = MODEL;
     const int q = own_columns(facts);
     void *to_free;
     scratch_t *scratch = aligned_scratch(sizeof(scratch_t), &to_free);
@@ -557,7 +549,7 @@ KERNEL int64_t sfm_misfit_tracks(int64_t num_images, const int64_t *rows, const 
     }
     block_t *b = &scratch->block;
     for (int64_t i = 0; i < num_images; ++i) {
-        const image_t image = image_of(i, rows, numbers, d_extra);
+        const image_t image = IMAGE(i);
         for (int64_t from = image.start; from < image.stop;) {
             int count = 0;
             for (; from < image.stop && count < SIZE; ++from) {

@@ -1,0 +1,175 @@
+"""The pooled tests of a camera from sums over the observations of its images (method.md section 5, *Cameras*).
+
+`audit.misfit.pooled.camera_tests` says what the numbers mean, and answers where digits do not last here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.kernels import kernels_in_use
+from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Tracks
+from sfm_audit.audit.misfit.features import FIELD_OF_FEATURE, widened, widened_columns
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS
+from sfm_audit.audit.misfit.pooled import PooledNormal, PooledSolution, PooledTests, judged
+from sfm_audit.audit.misfit.stacked import profiled, ranks_of
+from sfm_audit.audit.misfit.sums import ModelSums
+from sfm_audit.audit.table.words import GROUPS
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import SparseModel
+
+_POSE: Final = 6
+_MIN_OBSERVATIONS: Final = 64  # per image: of fewer the profiles of poses are more than the columns
+_SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns
+_TRACKS_AT_ONCE: Final = 1 << 15  # whose scores are in memory at the same time; numpy has all
+
+
+def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: Sequence[int]) -> PooledTests | None:
+    """Test a camera on its images; None where `camera_tests` has to say.
+
+    Parameters
+    ----------
+    images : rows of the image table, all of one camera
+
+    Notes
+    -----
+    Two passes over the observations. Memory: 3 kB for each image and 320 bytes for each of 32,768 tracks.
+    """
+    source = ModelSums(model, residuals)
+    num_observations = sum(source.num_of(image) for image in images)
+    if not images or not all(map(source.can_sum, images)) or num_observations < _MIN_OBSERVATIONS * len(images):
+        return None
+    with np.errstate(all="ignore"):  # what is out of range is in doubt
+        first = _first_pass(source, images)
+        solution = None if first is None else _solution(first)
+        if first is None or solution is None:
+            return None
+        normal = first.normal
+        z = solution.to_basis.T @ normal.on_y[: normal.num_intrinsics]
+        scores = normal.on_y[normal.num_intrinsics :] - solution.on_basis.T @ z
+        meat = _meat(source, images, first, solution)
+    tests = {group: judged(group, scores, meat, normal, solution) for group in GROUPS}
+    return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)
+
+
+class _Pooled(NamedTuple):
+    """After the first pass; C: the k intrinsics, E: the fields, in the units of `audit.misfit.features`.
+
+    to_basis: (I, 6, 6) to_basis P is an orthonormal basis of each image's pose columns P.    on_y: (I, 6) y - P on_y
+    is off P.    coefficients: (I, 6, k + 42) [C, E] - P coefficients is off P.
+    subtracted: (k + 42, k + 42) sum of the squares of coefficients, all columns of unit length.
+    track_of_point: (P,) number of each point among those that are seen, -1 for others.    offset: `affine_offset`.
+    """
+
+    normal: PooledNormal
+    to_basis: FloatArray
+    on_y: FloatArray
+    coefficients: FloatArray
+    subtracted: FloatArray
+    track_of_point: IntArray
+    offset: FloatArray
+
+
+def _first_pass(source: ModelSums, images: Sequence[int]) -> _Pooled | None:
+    """Accumulate over images; None where some pose is in doubt."""
+    gram = before = on_y = subtracted = np.zeros(())
+    num_observations, offset, profiles = 0, np.zeros(2), []
+    for window in source.windows(images):
+        own, y = window.sums()
+        wide, q = widened(own, window.offset, window.num_own), _POSE
+        found = profiled(wide, widened_columns(y, window.offset, window.num_own), q)
+        if not found.sure.all():
+            return None
+        length = 1.0 / found.scale[:, q:]
+        unit = found.coefficients * length[:, None, :]
+        gram = gram + (found.left * length[:, :, None] * length[:, None, :]).sum(axis=0)
+        before = before + wide[:, q:, q:].sum(axis=0)
+        on_y = on_y + (found.scores * length).sum(axis=0)
+        subtracted = subtracted + (unit.swapaxes(1, 2) @ unit).sum(axis=0)
+        profiles.append((found.to_basis, found.on_y, unit * found.scale[:, :q, None]))
+        num_observations += int(window.num_observations.sum())
+        offset = window.offset[0]
+    scale = 1.0 / np.sqrt(np.diagonal(before))
+    both = scale * scale[:, None]
+    track_of_point, num_tracks = source.tracks(images)
+    normal = PooledNormal(
+        gram * both,
+        before * both,
+        on_y * scale,
+        scale,
+        frozenset(),
+        2 * num_observations - _POSE * len(images),
+        len(images),
+        num_observations,
+        num_tracks,
+    )
+    to_basis, profiled_y, coefficients = (np.concatenate(parts) for parts in zip(*profiles, strict=True))
+    return _Pooled(normal, to_basis, profiled_y, coefficients, subtracted * both, track_of_point, offset)
+
+
+def _solution(first: _Pooled) -> PooledSolution | None:
+    """Profile the intrinsics, once for all images; None where digits or a rank are in doubt."""
+    normal = first.normal
+    k = normal.num_intrinsics
+    values, vectors = np.linalg.eigh(normal.gram[:k, :k])
+    if not values[0] > _SMALLEST_PIVOT:
+        return None
+    to_basis = np.asarray(vectors / np.sqrt(values))
+    on_basis = to_basis.T @ normal.gram[:k, k:]
+    left = normal.gram[k:, k:] - on_basis.T @ on_basis
+    on_intrinsics = to_basis @ on_basis
+    transforms = {}
+    for group, columns in GROUP_COLUMNS.items():
+        values, vectors = np.linalg.eigh(left[columns, columns])
+        # a direction of the fields, and what the intrinsics take of it: so much was subtracted with poses
+        direction = np.zeros((k + NUM_FIELDS, len(values)))
+        direction[:k] = -on_intrinsics[:, columns] @ vectors
+        direction[k:][columns] = vectors
+        with_poses = np.sqrt(np.maximum(np.einsum("ic,ij,jc->c", direction, first.subtracted, direction), 0.0))
+        along = np.concatenate([direction[:k], with_poses[None]])
+        ranks, certain = ranks_of(values[None], along[None])
+        if not certain[0]:
+            return None
+        kept = slice(len(values) - int(ranks[0]), None)
+        transforms[group] = np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
+    return PooledSolution(to_basis, on_basis, transforms)
+
+
+def _meat(source: ModelSums, images: Sequence[int], first: _Pooled, solution: PooledSolution) -> FloatArray:
+    """(42, 42) of the fields off all that was profiled, of unit length before: scores of tracks, block by block."""
+    normal = first.normal
+    basis, on_y, coefficients = _profiles(first, solution)
+    at_once = _TRACKS_AT_ONCE if kernels_in_use() else normal.num_tracks
+    meat = np.zeros((NUM_FEATURES, NUM_FEATURES))
+    for start in range(0, normal.num_tracks, at_once):
+        tracks = Tracks(first.track_of_point, start, min(start + at_once, normal.num_tracks))
+        per_track = np.zeros((tracks.last - tracks.first, NUM_FEATURES))
+        at = 0
+        for window in source.windows(images):
+            own = slice(at, at + len(window.images))
+            window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
+            at = own.stop
+        meat += per_track.T @ per_track
+    scale = normal.scale[normal.num_intrinsics :]
+    return np.asarray(widened(meat[None], first.offset[None], 0)[0] * scale * scale[:, None])
+
+
+def _profiles(first: _Pooled, solution: PooledSolution) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Basis (I, r, q), on_y (I, q) and coefficients (I, q, 40) of each image, as `WindowSums.add_tracks` takes them."""
+    normal = first.normal
+    k, num_images = normal.num_intrinsics, normal.num_images
+    scale, scale_of_fields = normal.scale[:k], normal.scale[k:]
+    to_basis = solution.to_basis * scale[:, None]
+    own = np.zeros((num_images, _POSE + k, to_basis.shape[1]))  # the basis of the intrinsics, in columns of N
+    own[:, :_POSE], own[:, _POSE:] = -first.coefficients[:, :, :k] @ to_basis, to_basis
+    basis = np.zeros((num_images, _POSE + to_basis.shape[1], _POSE + k))
+    basis[:, :_POSE, :_POSE], basis[:, _POSE:] = first.to_basis, own.swapaxes(1, 2)
+    on_y = own @ (solution.to_basis.T @ normal.on_y[:k])
+    on_y[:, :_POSE] += first.on_y
+    coefficients = own @ (solution.on_basis / scale_of_fields)
+    coefficients[:, :_POSE] += first.coefficients[:, :, k:]
+    return basis, on_y, np.ascontiguousarray(coefficients[:, :, FIELD_OF_FEATURE])
