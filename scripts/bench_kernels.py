@@ -22,11 +22,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.consistency import consistency_of
+from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
 from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.images import misfit_of_images
+from sfm_audit.audit.witnesses.asking import ask
+from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders import open_model
+from sfm_audit.loaders.evidence import NOTHING_GIVEN
 from sfm_audit.loaders.model import SparseModel
 
 ROUNDS: Final = 5
@@ -56,11 +60,19 @@ def cameras(model: SparseModel) -> Callable[[], object]:
     return lambda: camera_tests_of_sums(model, residuals, images)
 
 
+def witnesses(model: SparseModel) -> Callable[[], object]:
+    """What the model says of its images outside of each: who shares points with whom, who should see what."""
+    auditor = ModelAuditor(model)
+    given = model, auditor.residuals, auditor.sigma_constant_px, NOTHING_GIVEN
+    return lambda: ask(Evidence.of(*given))
+
+
 SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {
     "projection": projection,
     "consistency": consistency,
     "misfit": misfit,
     "cameras": cameras,
+    "witnesses": witnesses,
 }
 """From a model to what is timed; what it needs of the model is made before."""
 

@@ -109,7 +109,7 @@ def _model(folder: Path, num_images: int, num_keypoints: int) -> SparseModel:
 def _write_database(path: Path, model: SparseModel, num_pairs: int) -> int:
     """Write the pairs that share most points, and false ones where there are too few; return the number of matches."""
     rng = np.random.default_rng(1)
-    seen = covisibility(ModelAuditor(model).residuals, len(model.points))
+    seen = covisibility(ModelAuditor(model).residuals, len(model.points))[1]
     order = np.argsort(-seen.num_shared, kind="stable")[:num_pairs]
     pairs = list(zip(seen.first[order].tolist(), seen.second[order].tolist(), strict=True))
     others = (pair for pair in itertools.combinations(range(len(model.images)), 2) if pair not in set(pairs))

@@ -38,7 +38,19 @@ SANITIZE: Final = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-san
 RUNTIME: Final = "libasan.so"
 SOURCES_OF: Final = "audit/kernels/source"
 NO_KERNEL: Final = frozenset({"sfm_audit_sources"})
-CALLS: Final[dict[str, Callable[[np.random.Generator], None]]] = {}
+
+
+def call_pair_sums(rng: np.random.Generator) -> None:
+    """Compare images of models that are too small for it."""
+    from sfm_audit.audit.kernels import witnesses  # noqa: PLC0415 - in the child only
+
+    for num_points, num_images in ((1, 1), (40, 7), (9, 30)):
+        image, point = np.nonzero(rng.random((num_images, num_points)) < 0.5)
+        sees, views = rng.random(len(point)) < 0.5, (rng.normal(size=(3, len(point))), rng.normal(size=len(point)))
+        witnesses.pair_sums((num_points, num_images), point, image, sees, views)
+
+
+CALLS: Final[dict[str, Callable[[np.random.Generator], None]]] = {"witness_pair_sums": call_pair_sums}
 """By name: calls of a kernel's Python module with random arguments, for kernels that no audit here calls."""
 
 TRUSTED: Final[dict[str, frozenset[int]]] = {

@@ -11,7 +11,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.loaders.arrays import BoolArray, IntArray
+from sfm_audit.audit.kernels import witnesses as kernels
+from sfm_audit.loaders.arrays import BoolArray, Int32Array, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,22 +59,33 @@ class Covisibility:
         return np.isin(low * self.num_images + high, known)
 
 
-def covisibility(residuals: ModelResiduals, num_points: int) -> Covisibility:
-    """Count the shared points of all pairs of images, over their inliers; a point seen twice counts once."""
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenBy:
+    """Which images see each point, by their inliers; an image counts once, however often it observes a point.
+
+    offsets: (P + 1,) point p is seen by image_idx[offsets[p]:offsets[p + 1]], ascending.
+    """
+
+    offsets: IntArray
+    image_idx: Int32Array
+
+
+def covisibility(residuals: ModelResiduals, num_points: int) -> tuple[SeenBy, Covisibility]:
+    """Turn the inliers of images round, and count the shared points of all pairs of images."""
     num_images = len(residuals.offsets) - 1
-    image_idx = np.repeat(np.arange(num_images), np.diff(residuals.offsets))
-    shape = (num_images, max(num_points, 1))
-    sees = csr_array((np.ones(len(image_idx), dtype=np.int32), (image_idx, residuals.point_idx)), shape=shape)
-    sees.sum_duplicates()
-    sees.data[:] = 1
-    shared = (sees @ sees.T).tocoo()
+    found = kernels.shared_points(residuals.offsets, residuals.point_idx, num_points)
+    if found is not None:
+        return SeenBy(*found[0]), Covisibility(*found[1], num_images)
+    image_idx = np.repeat(np.arange(num_images, dtype=np.int32), np.diff(residuals.offsets))
+    shape = (max(num_points, 1), max(num_images, 1))
+    seen = csr_array((np.ones(len(image_idx), dtype=np.int32), (residuals.point_idx, image_idx)), shape=shape)
+    seen.sum_duplicates()
+    seen.data[:] = 1
+    shared = (seen.T.tocsr() @ seen).tocoo()
     upper = shared.row < shared.col
-    return Covisibility(
-        shared.row[upper].astype(np.int64),
-        shared.col[upper].astype(np.int64),
-        shared.data[upper].astype(np.int64),
-        num_images,
-    )
+    first, second, num_shared = (each[upper].astype(np.int64) for each in (shared.row, shared.col, shared.data))
+    offsets, images = seen.indptr[: num_points + 1].astype(np.int64), seen.indices.astype(np.int32)
+    return SeenBy(offsets, images), Covisibility(first, second, num_shared, num_images)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +98,9 @@ class Cuts:
 
 def cuts_of(graph: Covisibility) -> Cuts:
     """Return bridges and articulation vertices, by Tarjan's depth-first search."""
+    if (found := kernels.cuts(graph.first, graph.second, graph.num_images)) is not None:
+        bridges, articulation = found
+        return Cuts(bridges[np.lexsort(bridges.T[::-1])], articulation)
     search = _Search(graph)
     for root in range(graph.num_images):
         search.run(root)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from sfm_audit.audit.alignment.poses import camera_centres
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
-from sfm_audit.audit.witnesses.covisibility import Covisibility, covisibility
+from sfm_audit.audit.witnesses.covisibility import Covisibility, SeenBy, covisibility
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.evidence import Given, NotAsked, PositionPriors, ReferencePoses
 from sfm_audit.loaders.model import Finding, PairSource, SparseModel
@@ -44,9 +44,14 @@ class Evidence:
         return cls(model, residuals, sigma_px, given.pairs, given.reference, given.priors)
 
     @cached_property
+    def turned(self) -> tuple[SeenBy, Covisibility]:
+        """Which images see each point, and which images share how many points."""
+        return covisibility(self.residuals, len(self.model.points))
+
+    @property
     def seen(self) -> Covisibility:
         """Which images share how many points."""
-        return covisibility(self.residuals, len(self.model.points))
+        return self.turned[1]
 
     @cached_property
     def median_depth(self) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import eigh
 
+from sfm_audit.audit.kernels import witnesses as kernels
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
 from sfm_audit.audit.witnesses.should_see import MAX_ANGLE_DEG, MAX_DISTANCE_RATIO, ShouldSee, should_see
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -59,16 +60,38 @@ class Fold:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ClosePairs:
-    """Pairs of images (I, I), symmetric: points that both or either of two images see and both should.
+class PairSums:
+    """What pairs of images have in common, summed over the points that both should see; (k,) each.
 
-    close: close enough to see the same.    step: the angle between them, in steps.
+    first, second: rows of the images, first < second.    num: points.    both, either: seen by both, by either.
+    cosine: between their rays.    log_ratio: of their distances, first over second.
+    rest: product of what they see beyond what a point is seen on average.    own_rest: (I,) its square, by image.
     """
 
+    first: IntArray
+    second: IntArray
+    num: FloatArray
     both: FloatArray
     either: FloatArray
-    close: BoolArray
+    cosine: FloatArray
+    log_ratio: FloatArray
+    rest: FloatArray
+    own_rest: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClosePairs:
+    """Pairs of images (k,) that are close enough to see the same: points that both or either see and both should.
+
+    step: the angle between them, in steps.    num_images: of the model.
+    """
+
+    first: IntArray
+    second: IntArray
+    both: FloatArray
+    either: FloatArray
     step: IntArray
+    num_images: int
 
 
 def ask_fold(evidence: Evidence) -> WitnessReport | None:
@@ -76,7 +99,7 @@ def ask_fold(evidence: Evidence) -> WitnessReport | None:
     num_images = len(evidence.model.images)
     if not MIN_IMAGES <= num_images <= MAX_IMAGES:
         return None
-    found = find_fold(should_see(evidence.model, evidence.residuals))
+    found = find_fold(should_see(evidence.model, evidence.residuals, seen_by=evidence.turned[0]))
     if found is None:
         return None
     group = tuple(int(g) if g else None for g in found.group)
@@ -99,21 +122,55 @@ def find_fold(seen: ShouldSee) -> Fold | None:
     """Return the two groups that have least in common for how close they are; None where none can be told apart."""
     if seen.num_points < MIN_POINTS:
         return None
-    pairs = _close_pairs(seen)
-    found = [_judged(split, pairs) for split in _splits(seen)]
+    sums = pair_sums(seen)
+    pairs = _close_pairs(sums)
+    found = [_judged(split, pairs) for split in _splits(sums)]
     told = [fold for fold in found if fold is not None]
     return max(told, key=lambda fold: (fold.mixed > MIN_MIXED, fold.score), default=None)
 
 
-def _splits(seen: ShouldSee) -> Iterator[BoolArray]:
-    """Yield splits of the images by the leading eigenvectors of their co-detection, given who should see."""
+def pair_sums(seen: ShouldSee) -> PairSums:
+    """Compare all pairs of images over the points that both should see."""
+    log_distance = np.log(seen.distance)
+    sizes = seen.num_points, seen.num_images
+    found = kernels.pair_sums(sizes, seen.point, seen.image, seen.sees, (seen.ray, log_distance))
+    if found is not None:
+        return PairSums(*found)
     num = np.bincount(seen.point, minlength=seen.num_points)
     rate = np.bincount(seen.point, seen.sees, minlength=seen.num_points) / np.maximum(num, 1)
+    should, sees = seen.matrix(np.ones(len(seen.point))), seen.matrix(seen.sees)
+    together = crossed(should, should)
+    first, second = np.nonzero(np.triu(together, 1))
+
+    def of_pairs(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
+        return np.asarray(crossed(left, right)[first, second])
+
+    both = of_pairs(sees, sees)
+    half = crossed(sees, should)
+    either = half[first, second] + half[second, first] - both
+    cosine = np.sum([of_pairs(ray, ray) for ray in map(seen.matrix, seen.ray)], axis=0)
+    logs = crossed(seen.matrix(log_distance), should)
     rest = seen.matrix(seen.sees - rate[seen.point])
-    together = crossed(rest, rest)
-    size = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
-    together /= size[:, None] * size
-    np.fill_diagonal(together, 0.0)
+    rests = crossed(rest, rest)
+    return PairSums(
+        first,
+        second,
+        together[first, second],
+        both,
+        either,
+        cosine,
+        logs[first, second] - logs[second, first],
+        rests[first, second],
+        np.diag(rests).copy(),
+    )
+
+
+def _splits(sums: PairSums) -> Iterator[BoolArray]:
+    """Yield splits of the images by the leading eigenvectors of their co-detection, given who should see."""
+    size = np.sqrt(np.maximum(sums.own_rest, np.finfo(float).tiny))
+    together = np.zeros((len(size), len(size)))
+    together[sums.first, sums.second] = sums.rest / (size[sums.first] * size[sums.second])
+    together += together.T
     vectors = _leading(together)
     for k in range(vectors.shape[1]):
         yield vectors[:, k] > 0
@@ -143,44 +200,40 @@ def _leading(symmetric: FloatArray) -> FloatArray:
     return vectors
 
 
-def _close_pairs(seen: ShouldSee) -> _ClosePairs:
-    """Compare all pairs of images over the points that both should see."""
-    should, sees = seen.matrix(np.ones(len(seen.point))), seen.matrix(seen.sees)
-    both = crossed(sees, sees)
-    half = crossed(sees, should)
-    either = half + half.T - both
-    num = np.maximum(crossed(should, should), 1.0)
-    rays = [seen.matrix(seen.ray[k]) for k in range(3)]
-    cosine = np.sum([crossed(ray, ray) for ray in rays], axis=0) / num
-    logs = crossed(seen.matrix(np.log(seen.distance)), should)
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    close = (either >= _MIN_EITHER) & (angle < MAX_ANGLE_DEG)
-    close &= np.abs(logs - logs.T) < np.log(MAX_DISTANCE_RATIO) * num
-    np.fill_diagonal(close, val=False)
-    return _ClosePairs(both, either, close, (angle / _STEP_DEG).astype(np.int64))
+def _close_pairs(sums: PairSums) -> _ClosePairs:
+    """Choose the pairs that look in one direction from one distance."""
+    num = np.maximum(sums.num, 1.0)
+    angle = np.degrees(np.arccos(np.clip(sums.cosine / num, -1.0, 1.0)))
+    close = (sums.either >= _MIN_EITHER) & (angle < MAX_ANGLE_DEG)
+    close &= np.abs(sums.log_ratio) < np.log(MAX_DISTANCE_RATIO) * num
+    step = (angle[close] / _STEP_DEG).astype(np.int64)
+    return _ClosePairs(
+        sums.first[close], sums.second[close], sums.both[close], sums.either[close], step, len(sums.own_rest)
+    )
 
 
 def _judged(split: BoolArray, pairs: _ClosePairs) -> Fold | None:
     """Measure how much less two groups see of the same; None where they are hardly beside each other."""
-    takes_part = pairs.close.any(axis=1)
+    takes_part = np.zeros(pairs.num_images, dtype=np.bool_)
+    takes_part[pairs.first] = takes_part[pairs.second] = True
     group = np.where(takes_part, np.where(split, 1, 2), 0)
     sizes = np.bincount(group, minlength=3)
     if min(sizes[1], sizes[2]) < _MIN_GROUP:
         return None
     if sizes[2] > sizes[1]:
         group = np.where(group > 0, 3 - group, 0)
-    across = pairs.close & (split[:, None] != split)
+    across = split[pairs.first] != split[pairs.second]
     missing = expected = num_across = 0.0
     for step in range(int(MAX_ANGLE_DEG / _STEP_DEG)):
-        here = pairs.close & (pairs.step == step)
+        here = pairs.step == step
         cross, within = here & across, here & ~across
-        if np.count_nonzero(cross) >= _MIN_PAIRS // 2 and np.count_nonzero(within) >= _MIN_PAIRS:
+        if 2 * np.count_nonzero(cross) >= _MIN_PAIRS // 2 and 2 * np.count_nonzero(within) >= _MIN_PAIRS:
             share = pairs.both[within].sum() / pairs.either[within].sum()
-            expected += share * pairs.either[cross].sum()
-            missing += share * pairs.either[cross].sum() - pairs.both[cross].sum()
-            num_across += np.count_nonzero(cross)
+            expected += 2 * share * pairs.either[cross].sum()
+            missing += 2 * (share * pairs.either[cross].sum() - pairs.both[cross].sum())
+            num_across += 2 * np.count_nonzero(cross)
     if expected <= 0:
         return None
     first = sizes[1] / (sizes[1] + sizes[2])
-    at_random = 2 * first * (1 - first) * np.count_nonzero(pairs.close)
+    at_random = 2 * first * (1 - first) * 2 * len(pairs.step)
     return Fold(float(missing / expected), float(num_across / at_random), group)

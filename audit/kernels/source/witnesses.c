@@ -1,0 +1,369 @@
+/* Who sees which point, who should, and what pairs of images have in common. Twins: audit/witnesses/covisibility.py,
+ * should_see.py, fold.py. All indices are in range: the Python module has looked. */
+#include "kernel.h"
+
+static int ascending(const void *a, const void *b)
+{
+    const int64_t x = *(const int64_t *)a, y = *(const int64_t *)b;
+    return (x > y) - (x < y);
+}
+
+enum { LAST = 1 << 30 }; /* on the last image of each point, while pairs are counted */
+
+/* Turns (n,) observations round: next[p] moves to the end of the images that see point p, ascending, each once, which
+ * start at starts[p] of seen_image (n,). place: (n,) where the image stands in it, -1 where it has been before. */
+static void turn_round(int64_t num_images, const int64_t *offsets, const int64_t *point_idx, const int64_t *starts,
+                       int64_t *next, int32_t *seen_image, int32_t *place)
+{
+    for (int64_t i = 0; i < num_images; i++)
+        for (int64_t k = offsets[i]; k < offsets[i + 1]; k++) {
+            const int64_t p = point_idx[k], at = next[p];
+            const int again = at > starts[p] && seen_image[at - 1] == i;
+            place[k] = again ? -1 : (int32_t)at;
+            if (!again) {
+                seen_image[at] = (int32_t)i;
+                next[p]++;
+            }
+        }
+}
+
+typedef struct {
+    int64_t num, capacity;
+    int64_t *first, *second, *num_shared;
+} Pairs;
+
+/* The pairs of image i with images behind it. row: (I,) zeros before and after. */
+static void count_shared(int64_t i, const int32_t *place, int64_t size, const int32_t *seen_image, int64_t *row,
+                         int64_t *touched, Pairs *pairs)
+{
+    int64_t num_touched = 0;
+    for (int64_t k = 0; k < size; k++)
+        if (place[k] >= 0)
+            for (int64_t o = place[k]; !(seen_image[o] & LAST);) {
+                const int32_t other = seen_image[++o] & ~LAST;
+                if (!row[other]++)
+                    touched[num_touched++] = other;
+            }
+    qsort(touched, num_touched, sizeof *touched, ascending);
+    for (int64_t t = 0; t < num_touched; t++, pairs->num++) {
+        if (pairs->num < pairs->capacity) {
+            pairs->first[pairs->num] = i;
+            pairs->second[pairs->num] = touched[t];
+            pairs->num_shared[pairs->num] = row[touched[t]];
+        }
+        row[touched[t]] = 0;
+    }
+}
+
+/* seen_offsets (num_points + 1), seen_image (n,): the images that see each point, ascending, each once. first < second,
+ * num_shared (capacity,) each: pairs of images with the points that they share, by first and then by second.
+ * Returns the number of pairs, of which those that fit are written; negative without memory. */
+KERNEL int64_t witness_shared(int64_t num_images, int64_t num_points, const int64_t *offsets, const int64_t *point_idx,
+                              int64_t *seen_offsets, int32_t *seen_image, int64_t capacity, int64_t *first,
+                              int64_t *second, int64_t *num_shared)
+{
+    int64_t *next = malloc((num_points + 1) * sizeof *next), *touched = malloc((num_images + 1) * sizeof *touched);
+    int64_t *row = calloc(num_images + 1, sizeof *row);
+    int32_t *place = malloc((offsets[num_images] + 1) * sizeof *place);
+    Pairs pairs = {next && touched && row && place ? 0 : -1, capacity, first, second, num_shared};
+    if (!pairs.num) {
+        memset(seen_offsets, 0, (num_points + 1) * sizeof *seen_offsets);
+        for (int64_t k = 0; k < offsets[num_images]; k++)
+            seen_offsets[point_idx[k] + 1]++;
+        for (int64_t p = 0; p < num_points; p++)
+            seen_offsets[p + 1] += seen_offsets[p];
+        memcpy(next, seen_offsets, (num_points + 1) * sizeof *next);
+        turn_round(num_images, offsets, point_idx, seen_offsets, next, seen_image, place);
+        for (int64_t p = 0; p < num_points; p++)
+            if (next[p] > seen_offsets[p])
+                seen_image[next[p] - 1] |= LAST;
+        for (int64_t i = 0; i < num_images; i++)
+            count_shared(i, place + offsets[i], offsets[i + 1] - offsets[i], seen_image, row, touched, &pairs);
+        int64_t end = 0;
+        for (int64_t p = 0; p < num_points; p++) { /* close the gaps of second observations */
+            const int64_t start = seen_offsets[p];
+            seen_offsets[p] = end;
+            for (int64_t o = start; o < next[p]; o++)
+                seen_image[end++] = seen_image[o] & ~LAST;
+        }
+        seen_offsets[num_points] = end;
+    }
+    free(next);
+    free(touched);
+    free(row);
+    free(place);
+    return pairs.num;
+}
+
+/* Bridges and articulation vertices of a graph whose vertex v has the neighbours neighbour[offsets[v]:offsets[v + 1]],
+ * by Tarjan's depth-first search. bridges: (num, 2). Returns the number of bridges; negative without memory. */
+KERNEL int64_t witness_cuts(int64_t num, const int64_t *offsets, const int64_t *neighbour, int64_t *bridges,
+                            uint8_t *articulation)
+{
+    int64_t *order = malloc((5 * num + 1) * sizeof *order);
+    if (!order)
+        return -1;
+    int64_t *low = order + num, *parent = low + num, *next = parent + num, *path = next + num;
+    int64_t num_visited = 0, num_bridges = 0;
+    memset(articulation, 0, num);
+    for (int64_t v = 0; v < num; v++) {
+        order[v] = -1;
+        next[v] = offsets[v];
+    }
+    for (int64_t root = 0; root < num; root++) {
+        if (order[root] >= 0)
+            continue;
+        int64_t depth = 0, num_children = 0;
+        path[0] = root;
+        parent[root] = -1;
+        order[root] = low[root] = num_visited++;
+        while (depth >= 0) {
+            const int64_t v = path[depth];
+            if (next[v] < offsets[v + 1]) {
+                const int64_t w = neighbour[next[v]++];
+                if (order[w] < 0) {
+                    parent[w] = v;
+                    order[w] = low[w] = num_visited++;
+                    path[++depth] = w;
+                } else if (w != parent[v] && order[w] < low[v])
+                    low[v] = order[w];
+                continue;
+            }
+            const int64_t u = parent[v];
+            depth--;
+            if (u < 0)
+                continue;
+            num_children += u == root;
+            if (low[v] < low[u])
+                low[u] = low[v];
+            if (low[v] > order[u]) {
+                bridges[2 * num_bridges] = u < v ? u : v;
+                bridges[2 * num_bridges++ + 1] = u < v ? v : u;
+            }
+            if (low[v] >= order[u] && u != root)
+                articulation[u] = 1;
+        }
+        articulation[root] = num_children > 1;
+    }
+    free(order);
+    return num_bridges;
+}
+
+/* One image that sees a point: the point, the ray from it to the image, its length. */
+typedef struct {
+    int64_t point;
+    double ray[3], distance;
+} Sight;
+
+typedef struct {
+    int64_t num_points;
+    const double *xyz; /* (3, p) */
+    int64_t *ends;     /* (I + 1,): sights ends[i - 1] .. ends[i] are of image i, those of image 0 begin at 0 */
+    Sight *sights;
+    double *farthest; /* (I,) distance */
+    double reach, ratio, cosine;
+} Seen;
+
+/* What is known of the points that image j may see: its number where anything is, inside, sees, should see. */
+typedef struct {
+    int64_t image;
+    double ray[3], distance;
+    uint8_t inside, sees, should;
+} State;
+
+static void look(State *state, int64_t j, const double *x, const double *rotation, const double *centre,
+                 const double *limits)
+{
+    const double dx = x[0] - centre[0], dy = x[1] - centre[1], dz = x[2] - centre[2];
+    const double depth = rotation[6] * dx + rotation[7] * dy + rotation[8] * dz, limit = depth * limits[0];
+    state->image = j;
+    state->sees = state->should = 0;
+    state->inside = fabs(rotation[0] * dx + rotation[1] * dy + rotation[2] * dz) < limit * limits[1] &&
+                    fabs(rotation[3] * dx + rotation[4] * dy + rotation[5] * dz) < limit * limits[2] && depth > 0.0;
+    if (!state->inside)
+        return;
+    state->distance = sqrt(dx * dx + dy * dy + dz * dz);
+    const double length = state->distance > DBL_MIN ? state->distance : DBL_MIN;
+    state->ray[0] = -dx / length;
+    state->ray[1] = -dy / length;
+    state->ray[2] = -dz / length;
+}
+
+/* One image: every point that an image sees that stands close enough to it. */
+static void ask(const Seen *seen, State *states, uint64_t *found, int64_t j, int64_t num_images,
+                const double *rotation, const double *centre, const double *limits)
+{
+    for (int64_t i = 0; i < num_images; i++) {
+        double sq = 0.0;
+        for (int a = 0; a < 3; a++)
+            sq += (centre[3 * i + a] - centre[3 * j + a]) * (centre[3 * i + a] - centre[3 * j + a]);
+        const double nearest = sqrt(sq) / seen->reach;
+        if (!(nearest <= seen->farthest[i]))
+            continue;
+        for (const Sight *one = seen->sights + (i ? seen->ends[i - 1] : 0); one < seen->sights + seen->ends[i]; one++) {
+            if (!(one->distance >= nearest))
+                continue;
+            State *state = states + one->point;
+            if (state->image != j) {
+                const double *x = seen->xyz + one->point;
+                const double point[3] = {x[0], x[seen->num_points], x[2 * seen->num_points]};
+                look(state, j, point, rotation + 9 * j, centre + 3 * j, limits + 3 * j);
+            }
+            if (!state->inside)
+                continue;
+            if (i == j)
+                state->sees = state->should = 1;
+            else if (!state->should && state->distance < seen->ratio * one->distance &&
+                     state->distance * seen->ratio > one->distance)
+                state->should = one->ray[0] * state->ray[0] + one->ray[1] * state->ray[1] +
+                                    one->ray[2] * state->ray[2] > seen->cosine;
+            if (state->should)
+                found[one->point / 64] |= (uint64_t)1 << (one->point % 64);
+        }
+    }
+}
+
+/* The sights of all points, by image. ends: (I + 1,) zeros, farthest: (I,) zeros. */
+static void by_image(const Seen *seen, const int64_t *offsets, const int64_t *seen_image, const double *seen_ray,
+                     const double *seen_distance, int64_t num_images)
+{
+    const int64_t num = offsets[seen->num_points];
+    int64_t *starts = seen->ends; /* move to the ends while they are filled */
+    for (int64_t o = 0; o < num; o++) {
+        starts[seen_image[o] + 1]++;
+        if (seen_distance[o] > seen->farthest[seen_image[o]])
+            seen->farthest[seen_image[o]] = seen_distance[o];
+    }
+    for (int64_t i = 0; i < num_images; i++)
+        starts[i + 1] += starts[i];
+    for (int64_t p = 0; p < seen->num_points; p++)
+        for (int64_t o = offsets[p]; o < offsets[p + 1]; o++)
+            seen->sights[starts[seen_image[o]]++] =
+                (Sight){p, {seen_ray[o], seen_ray[num + o], seen_ray[2 * num + o]}, seen_distance[o]};
+}
+
+/* The points that each image should see, image after image, points ascending: (capacity,) each, ray (capacity, 3).
+ * offsets: (num_points + 1,) the images (n,) that see each point, ray (3, n) to them, distance (n,).
+ * limits: (I, 3) share of the depth per px, width, height. Returns how many there are, of which those that fit are
+ * written; negative without memory. */
+KERNEL int64_t witness_should_see(int64_t num_images, int64_t num_points, const double *xyz, const int64_t *offsets,
+                                  const int64_t *seen_image, const double *seen_ray, const double *seen_distance,
+                                  const uint8_t *usable, const double *rotation, const double *centre,
+                                  const double *limits, double reach, double ratio, double cosine, int64_t capacity,
+                                  int64_t *point, int64_t *image, uint8_t *sees, double *ray, double *distance)
+{
+    const int64_t num_words = num_points / 64 + 1;
+    const Seen seen = {num_points, xyz, calloc(num_images + 1, sizeof(int64_t)),
+                       malloc((offsets[num_points] + 1) * sizeof(Sight)), calloc(num_images + 1, sizeof(double)),
+                       reach, ratio, cosine};
+    State *states = malloc((num_points + 1) * sizeof *states);
+    uint64_t *found = calloc(num_words, sizeof *found);
+    int64_t num = seen.ends && seen.sights && seen.farthest && states && found ? 0 : -1;
+    if (!num)
+        by_image(&seen, offsets, seen_image, seen_ray, seen_distance, num_images);
+    for (int64_t p = 0; !num && p < num_points; p++)
+        states[p].image = -1;
+    for (int64_t j = 0; num >= 0 && j < num_images; j++) {
+        if (!usable[j])
+            continue;
+        ask(&seen, states, found, j, num_images, rotation, centre, limits);
+        for (int64_t w = 0; w < num_words; w++)
+            for (; found[w]; found[w] &= found[w] - 1, num++) {
+                const int64_t p = 64 * w + __builtin_ctzll(found[w]);
+                if (num >= capacity)
+                    continue;
+                point[num] = p;
+                image[num] = j;
+                sees[num] = states[p].sees;
+                memcpy(ray + 3 * num, states[p].ray, sizeof states[p].ray);
+                distance[num] = states[p].distance;
+            }
+    }
+    free(seen.ends);
+    free(seen.sights);
+    free(seen.farthest);
+    free(states);
+    free(found);
+    return num;
+}
+
+enum { NUM_SUMS = 6 };
+
+/* One image that should see a point; rest: what it sees beyond the point's rate. */
+typedef struct {
+    int64_t image;
+    double sees, ray[3], log_distance, rest;
+} View;
+
+/* Rows of sums: num, both, either, cosine, log of the ratio of distances, rest. */
+static void compare(const View *a, const View *b, double *sums)
+{
+    sums[0] += 1.0;
+    sums[1] += a->sees * b->sees;
+    sums[2] += a->sees + b->sees - a->sees * b->sees;
+    sums[3] += a->ray[0] * b->ray[0] + a->ray[1] * b->ray[1] + a->ray[2] * b->ray[2];
+    sums[4] += a->log_distance - b->log_distance;
+    sums[5] += a->rest * b->rest;
+}
+
+/* The rows (m,) in the order of points; offsets (num_points + 1,): those of point p end at offsets[p]. */
+static void by_point(int64_t num_points, int64_t num_rows, const int64_t *point, int64_t *offsets, int64_t *order)
+{
+    for (int64_t row = 0; row < num_rows; row++)
+        offsets[point[row] + 1]++;
+    for (int64_t p = 0; p < num_points; p++)
+        offsets[p + 1] += offsets[p];
+    for (int64_t row = 0; row < num_rows; row++)
+        order[offsets[point[row]]++] = row;
+}
+
+/* Compares the images that should see each point. point, image, sees, ray (3, m), log_distance: (m,), image by image.
+ * number: (I, I) zeros, in which pairs are numbered from 1 as they are met.
+ * first, second: (capacity,), sums: (capacity, 6), own_rest: (I,) zeros. Returns the number of pairs; negative without
+ * memory, or if the images are not in order. */
+KERNEL int64_t witness_pair_sums(int64_t num_images, int64_t num_points, int64_t num_rows, const int64_t *point,
+                                 const int64_t *image, const uint8_t *sees, const double *ray,
+                                 const double *log_distance, int32_t *number, int64_t capacity, int64_t *first,
+                                 int64_t *second, double *sums, double *own_rest)
+{
+    View *views = malloc((num_images + 1) * sizeof *views);
+    int64_t *ends = calloc(num_points + 1, sizeof *ends), *order = malloc((num_rows + 1) * sizeof *order);
+    int64_t num = views && ends && order ? 0 : -1;
+    if (!num)
+        by_point(num_points, num_rows, point, ends, order);
+    for (int64_t p = 0; num >= 0 && p < num_points; p++) {
+        const int64_t start = p ? ends[p - 1] : 0, size = ends[p] - start;
+        double rate = 0.0;
+        for (int64_t k = 0; num >= 0 && k < size; k++) {
+            const int64_t row = order[start + k];
+            if (k && image[row] <= views[k - 1].image)
+                num = -1;
+            else
+                views[k] = (View){image[row], sees[row], {ray[row], ray[num_rows + row], ray[2 * num_rows + row]},
+                                  log_distance[row], 0.0};
+            rate += sees[row];
+        }
+        rate /= size ? (double)size : 1.0;
+        for (int64_t k = 0; num >= 0 && k < size; k++) {
+            views[k].rest = views[k].sees - rate;
+            own_rest[views[k].image] += views[k].rest * views[k].rest;
+        }
+        for (int64_t k = 0; num >= 0 && k < size; k++)
+            for (int64_t l = k + 1; l < size; l++) {
+                int32_t *own = number + views[k].image * num_images + views[l].image;
+                if (!*own) {
+                    if (num == capacity)
+                        continue;
+                    first[num] = views[k].image;
+                    second[num] = views[l].image;
+                    memset(sums + NUM_SUMS * num, 0, NUM_SUMS * sizeof *sums);
+                    *own = (int32_t)++num;
+                }
+                compare(views + k, views + l, sums + NUM_SUMS * (*own - 1));
+            }
+    }
+    free(views);
+    free(ends);
+    free(order);
+    return num;
+}
