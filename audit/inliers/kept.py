@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from sfm_audit.audit.cameras import is_fisheye
 from sfm_audit.audit.inliers.sanity import params_of, usable_cameras
+from sfm_audit.audit.inliers.small import SmallImages, groups, project_small
 from sfm_audit.audit.inliers.stationarity import offsets_of_sums
 from sfm_audit.audit.kernels.projection import LENSES, NO_LENS, NUM_PARAMS, Projected, Scene, project_scene
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -45,6 +46,11 @@ class Kept:
         else:
             self.rows, self.residuals_px, self.point_jacobian = found.rows, found.residuals_px, found.point_jacobian
             self._take(found, np.diff(self._first))
+        small = [each for images in groups(model, self.missing) if (each := project_small(model, images)) is not None]
+        for each in small:
+            self._take_small(each)
+        taken = np.concatenate([np.empty(0, dtype=np.int64), *(each.images for each in small)])
+        self.missing = np.setdiff1d(self.missing, taken, assume_unique=True)
 
     def _take(self, found: Projected, num_linked: IntArray) -> None:
         """Book the images that are done."""
@@ -62,6 +68,19 @@ class Kept:
         offsets, is_sure = offsets_of_sums(found.pose_gram, found.pose_right, num)
         self.pose_offset_px[:] = np.where(found.done & is_sure, offsets, np.nan)
         self.unsure = np.flatnonzero(found.done & ~is_sure & (num > 0))
+
+    def _take_small(self, found: SmallImages) -> None:
+        """Book small images of one camera, all of whose observations are inliers."""
+        self.rows[found.rows] = found.rows
+        self.residuals_px[:, found.rows] = found.residuals_px
+        self.point_jacobian[:, :, found.rows] = found.point_jacobian
+        images, num = found.images, np.diff(found.offsets)
+        for image_idx, start, count in zip(images.tolist(), found.offsets.tolist(), num.tolist(), strict=False):
+            self._extra[image_idx] = found.d_extra[:, :, start : start + count]
+        self._counts[_INLIERS, images] = num
+        offsets, is_sure = offsets_of_sums(found.pose_gram, found.pose_right, num)
+        self.pose_offset_px[images] = np.where(is_sure, offsets, np.nan)
+        self.unsure = np.concatenate([self.unsure, images[~is_sure]])
 
     def put(
         self,

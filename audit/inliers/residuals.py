@@ -10,7 +10,14 @@ import numpy as np
 from sfm_audit.audit.cameras import project_columns
 from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
 from sfm_audit.audit.inliers.kept import Kept
-from sfm_audit.audit.inliers.sanity import MAX_RESIDUAL_PX, is_differentiable, is_sane, is_usable
+from sfm_audit.audit.inliers.sanity import (
+    MAX_RESIDUAL_PX,
+    are_differentiable,
+    are_sane,
+    is_differentiable,
+    is_sane,
+    is_usable,
+)
 from sfm_audit.audit.inliers.stationarity import pose_offset_px, pose_offsets_px
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel, rotation_from_quat
@@ -100,7 +107,7 @@ def image_residuals(
     with np.errstate(all="ignore"):
         xyz_cam = image.cam_from_world(xyz_world)
         usable = camera is not None and is_usable(camera)
-        finite = linked & is_sane(xyz_cam).all(axis=1) & is_sane(xy_px).all(axis=1) & usable
+        finite = linked & usable & _sane_rows(xyz_cam) & _sane_rows(xy_px)
         spherical = camera is not None and camera.model.is_spherical
         candidate = finite & ((xyz_cam != 0).any(axis=1) if spherical else xyz_cam[:, 2] > 0)
         num_behind = int(np.count_nonzero(finite)) - int(np.count_nonzero(candidate))
@@ -110,10 +117,10 @@ def image_residuals(
             all_in = rows.size == linked.size
             xyz_cam = xyz_cam if all_in else xyz_cam[rows]
             residuals, jacobian, d_extra = _residuals(camera, xy_px if all_in else xy_px[rows], xyz_cam)
-        valid = (np.abs(residuals) <= MAX_RESIDUAL_PX).all(axis=0)
-        valid &= is_differentiable(jacobian, xyz_cam) | ~np.isfinite(jacobian).all(axis=(0, 1))  # poles of panoramas
-    num_unprojected = valid.size - int(np.count_nonzero(valid))
-    if num_unprojected:
+        valid = _valid(residuals, jacobian, xyz_cam)
+    num_unprojected = 0
+    if valid is not None:
+        num_unprojected = valid.size - int(np.count_nonzero(valid))
         rows, xyz_cam = rows[valid], xyz_cam[valid]
         residuals, jacobian, d_extra = residuals[:, valid], jacobian[:, :, valid], d_extra[:, :, valid]
     return ImageResiduals(
@@ -127,6 +134,21 @@ def image_residuals(
         linked.size - num_dangling - num_behind - rows.size,
         num_unprojected,
     )
+
+
+def _sane_rows(rows: FloatArray) -> BoolArray | np.bool_:
+    """Whether the numbers of each row are sane, (n,); True for all where the largest tells it."""
+    return np.True_ if are_sane(rows) else is_sane(rows).all(axis=1)
+
+
+def _valid(residuals_px: FloatArray, jacobian_cam: FloatArray, xyz_cam: FloatArray) -> BoolArray | None:
+    """Which projections (n,) can be calculated with; None where all can, which one look at the largest tells."""
+    is_small = np.abs(residuals_px).max(initial=0.0) <= MAX_RESIDUAL_PX  # false with NaN
+    if is_small and (not residuals_px.size or are_differentiable(jacobian_cam, xyz_cam)):
+        return None
+    valid = (np.abs(residuals_px) <= MAX_RESIDUAL_PX).all(axis=0)
+    valid &= is_differentiable(jacobian_cam, xyz_cam) | ~np.isfinite(jacobian_cam).all(axis=(0, 1))  # panoramas' poles
+    return None if valid.all() else valid
 
 
 def _residuals(

@@ -27,6 +27,17 @@ def is_sane(values: FloatArray) -> BoolArray:
     return np.asarray(np.abs(values) <= MAX_MAGNITUDE)
 
 
+def are_sane(values: FloatArray) -> bool:
+    """Whether all are."""
+    return bool(np.abs(values).max(initial=0.0) <= MAX_MAGNITUDE)
+
+
+def are_differentiable(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> bool:
+    """Whether all derivatives are, as the largest of them and the largest distance tell; False where they do not."""
+    largest = float(np.abs(jacobian_cam).max(initial=0.0))
+    return largest <= _MAX_DERIVATIVE and largest * float(np.abs(xyz_cam).max(initial=0.0)) <= MAX_MAGNITUDE
+
+
 def is_differentiable(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> BoolArray:
     """Whether derivatives (2, 3, n) px per unit at points (n, 3) in the camera frame can be calculated with, (n,).
 
