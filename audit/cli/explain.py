@@ -19,9 +19,9 @@ from sfm_audit.audit.config import NoiseName, PointsName
 from sfm_audit.audit.table import TABLES
 from sfm_audit.loaders import LoadError, SparseModel, discover, open_model
 from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.run_folder.disk import RUN_JSON
 from sfm_audit.reports.run_folder.new_files import new_folder
 from sfm_audit.reports.run_folder.reader import Row, RunReader
-from sfm_audit.reports.run_folder.record import RUN_JSON
 from sfm_audit.reports.text.wording import plain
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from sfm_audit.loaders.datasets.image_counts import count_images_of
 from sfm_audit.loaders.datasets.layouts import LAYOUTS
 from sfm_audit.loaders.datasets.selection import Selection, read_scene_list, select
 from sfm_audit.loaders.paths.locations import parse_location
-from sfm_audit.reports.run_folder.record import RUN_JSON
+from sfm_audit.reports.run_folder.disk import RUN_JSON
 from sfm_audit.reports.text.wording import plain
 
 UNKNOWN: Final = "-"

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from sfm_audit.audit.cli.errors import ExitCode, KnownError
 from sfm_audit.reports.errors import RunFolderError
+from sfm_audit.reports.run_folder.disk import RUN_JSON
 from sfm_audit.reports.run_folder.reader import RunReader
-from sfm_audit.reports.run_folder.record import RUN_JSON
 
 _SHAPE: Final = 1  # raised when a key changes its meaning or goes
 _NAMES: Final = ("tool", "version", "status", "config", "counts", "failures", "seconds")

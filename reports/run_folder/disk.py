@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from sfm_audit.reports.errors import OutputError
 
+RUN_JSON: Final = "run.json"
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)  # opening a pipe that nobody writes to waits for ever
 _NO_LINKS: Final = getattr(os, "O_NOFOLLOW", 0)
 _BINARY: Final = getattr(os, "O_BINARY", 0)

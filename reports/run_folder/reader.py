@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sfm_audit.reports.errors import DamagedRunError, RunFolderError
@@ -131,7 +131,7 @@ class RunReader:
             return None
         with self._part(table, model) as part:
             read = part.read(columns=[*columns, "image_id"])
-            return read.filter(pc.field("image_id") == image_id)
+        return read.filter(pa.array(read["image_id"].to_numpy() == image_id))
 
     def rows_of_camera(self, name: str, camera_id: int, columns: Sequence[str]) -> pa.Table:
         """Return the observations of all images of a camera in the part called ``name``.
@@ -147,9 +147,10 @@ class RunReader:
             raise DamagedRunError(self.folder, f"its {MANIFEST} names no part {name}")
         with self._part("images", model) as part:
             images = part.read(columns=["image_id", "camera_id"])
-        mine = images.filter(pc.field("camera_id") == camera_id)["image_id"]
+        mine = images["image_id"].to_numpy()[images["camera_id"].to_numpy() == camera_id]
         with self._part("observations", model) as part:
-            return part.read(columns=[*columns, "image_id"]).filter(pc.field("image_id").isin(mine.combine_chunks()))
+            read = part.read(columns=[*columns, "image_id"])
+        return read.filter(pa.array(np.isin(read["image_id"].to_numpy(), mine)))
 
     def _revised_rows(self, table: str, model: ModelRecord, columns: Sequence[str]) -> list[Row]:
         """Return the rows of a table of one model, revised."""

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sfm_audit.reports.errors import DamagedRunError, RunFolderError
-from sfm_audit.reports.run_folder.disk import read_plain
+from sfm_audit.reports.run_folder.disk import RUN_JSON, read_plain
 
 TOOL: Final = "sfm-audit"
-RUN_JSON: Final = "run.json"
 MAX_RUN_JSON_BYTES: Final = 32_000_000  # 100,000 inputs that cannot be read
 _SHOWN: Final = 80
 

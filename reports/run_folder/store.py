@@ -26,11 +26,11 @@ from sfm_audit.loaders.datasets.discover import ModelRef
 from sfm_audit.loaders.datasets.input_state import InputState
 from sfm_audit.loaders.paths.locations import real_location
 from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
-from sfm_audit.reports.run_folder.disk import append_line, flush_folder, write_whole, writing
+from sfm_audit.reports.run_folder.disk import RUN_JSON, append_line, flush_folder, write_whole, writing
 from sfm_audit.reports.run_folder.lock import LOCK, OWNER, LockedError, RunLock
 from sfm_audit.reports.run_folder.manifest import MANIFEST, Manifest, dropped_line, line_of, parsed_or_none, with_hash
 from sfm_audit.reports.run_folder.parts import METADATA_KEY, fits, part_path, part_record
-from sfm_audit.reports.run_folder.record import RUN_JSON, TOOL, ModelRecord, PartRecord, read_run_json
+from sfm_audit.reports.run_folder.record import TOOL, ModelRecord, PartRecord, read_run_json
 
 TABLES: Final = ("images", "cameras", "models")  # in the order in which a model's parts are written
 COUNTED: Final = ("num_images", "num_accepted", "num_rejected", "num_undetermined")

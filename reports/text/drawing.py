@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import StringIO
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rich import box
 from rich.cells import cell_len
@@ -13,8 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm_audit.reports.run_folder.reader import Row
 from sfm_audit.reports.text.wording import paragraph, shorten
+
+if TYPE_CHECKING:
+    from sfm_audit.reports.run_folder.reader import Row
 
 ASCII_HEAD: Final = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)
 _MIN_NAME: Final = 12
