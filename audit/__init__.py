@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
-    from sfm_audit.audit.decision.decide import Decision
+    from sfm_audit.audit.decision.decisions import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
     from sfm_audit.audit.engine.model import ModelAuditor, audit_model
     from sfm_audit.audit.engine.tables import ModelAudit
@@ -37,7 +37,7 @@ _HOMES: Final = {
     "sfm_audit.audit.engine.tables": ("ModelAudit",),
     "sfm_audit.audit.engine.image": ("ImageAudit", "audit_inliers"),
     "sfm_audit.audit.table": ("ModelLabels",),
-    "sfm_audit.audit.decision.decide": ("Decision",),
+    "sfm_audit.audit.decision.decisions": ("Decision",),
     "sfm_audit.audit.table.words": ("Reason", "ReasonCode", "Verdict"),
 }
 

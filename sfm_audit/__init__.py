@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from sfm_audit.audit.config import AuditConfig
-    from sfm_audit.audit.decision.decide import Decision
+    from sfm_audit.audit.decision.decisions import Decision
     from sfm_audit.audit.engine.image import ImageAudit, audit_inliers
     from sfm_audit.audit.engine.model import ModelAuditor, audit_model
     from sfm_audit.audit.engine.tables import ModelAudit
@@ -54,7 +54,7 @@ __all__ = [
 _HOMES: Final = {
     "AuditConfig": "audit.config",
     "ImageAudit": "audit.engine.image",
-    "Decision": "audit.decision.decide",
+    "Decision": "audit.decision.decisions",
     "LoadError": "loaders.errors",
     "ModelAudit": "audit.engine.tables",
     "ModelAuditor": "audit.engine.model",

@@ -24,7 +24,8 @@ from sfm_audit.audit.camera_quality.expected_error import ExpectedErrorMap
 from sfm_audit.audit.camera_quality.identifiability import Identifiability
 from sfm_audit.audit.camera_quality.plausibility import CameraPlausibility
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import Decision, decide
+from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.decisions import Decision
 from sfm_audit.audit.decision.diagnostics import (
     CameraDiagnostics,
     Diagnostics,
@@ -32,7 +33,7 @@ from sfm_audit.audit.decision.diagnostics import (
     NoiseDiagnostics,
     misfit_groups,
 )
-from sfm_audit.audit.decision.members import Judgement, undetermined
+from sfm_audit.audit.decision.judged import Judgement, undetermined
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.inliers.residuals import longest_px
 from sfm_audit.audit.inliers.stationarity import pose_offset_px

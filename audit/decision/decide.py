@@ -1,139 +1,88 @@
-"""The only place that decides: from the diagnostics of one image and the settings to all verdicts."""
+"""The only place that decides: from what is measured of images and the settings to all verdicts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import numpy as np
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision.camera import judge_camera, pose_alone
+from sfm_audit.audit.decision.decisions import MEMBERS, Decision, Decisions
 from sfm_audit.audit.decision.diagnostics import Diagnostics
-from sfm_audit.audit.decision.members import (
-    Judgement,
-    judge_ks,
-    judge_misfit,
-    judge_noise,
-    judge_plausible,
-    judge_pose,
-)
-from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
+from sfm_audit.audit.decision.judged import Judged, said_of
+from sfm_audit.audit.decision.measured import Measured
+from sfm_audit.audit.decision.members import judge_ks, judge_noise, judge_plausible, judge_pose, taus_px
+from sfm_audit.audit.decision.misfit import decide_misfits, judge_misfit
 from sfm_audit.audit.decision.outside import judge_outside
-from sfm_audit.audit.decision.severity import severity_of
-from sfm_audit.audit.table.words import POLICIES, Member, PolicyName, Reason, ReasonCode, Severity, Verdict, strongest
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Decision:
-    """What is said of one image.
-
-    members: each question's judgement; a question that was not asked is missing.
-    judgement: of the policy, with the reasons of its members.    misfit: None where nothing was tested.
-    severity: of the members' rejections; None where no member rejects.    pose_first: the pose explains what freeing
-    pose and camera would gain, so its reasons come before the camera's.
-    """
-
-    members: Mapping[Member, Judgement]
-    judgement: Judgement
-    misfit: MisfitDecision | None
-    severity: Severity | None = None
-    pose_first: bool = False
-
-    @property
-    def verdict(self) -> Verdict:
-        """The verdict of the policy."""
-        return self.judgement.verdict
-
-    @property
-    def reasons(self) -> tuple[Reason, ...]:
-        """The reasons of the policy's members."""
-        return self.judgement.reasons
-
-    @property
-    def all_reasons(self) -> tuple[Reason, ...]:
-        """The reasons of all members that were asked, in the order of `Member`."""
-        return tuple(reason for judgement in self.members.values() for reason in judgement.reasons)
-
-    def of(self, member: Member) -> Verdict | None:
-        """The verdict of one member, None where it was not asked."""
-        judgement = self.members.get(member)
-        return None if judgement is None else judgement.verdict
-
-    def under(self, policy: PolicyName) -> Judgement:
-        """Return the verdict of a policy with the reasons of its members."""
-        return judgement_under(self.members, policy, pose_first=self.pose_first)
+from sfm_audit.audit.decision.severity import severities_of
+from sfm_audit.audit.table.words import VERDICT_ORDER, Member, Reason, ReasonCode, Verdict
+from sfm_audit.loaders.arrays import BoolArray
 
 
 def decide(diagnostics: Diagnostics, settings: AuditConfig) -> Decision:
-    """Decide about one image or one estimated camera.
+    """Decide about one image or one estimated camera, as `decide_all` does about many."""
+    return decide_all(Measured.of([diagnostics]), settings).decision(0)
+
+
+def decide_all(measured: Measured, settings: AuditConfig) -> Decisions:
+    """Decide about images.
 
     Parameters
     ----------
-    diagnostics : the numbers            settings : thresholds and the policy
+    measured : the numbers            settings : thresholds and the policy
 
     Returns
     -------
-    Decision
+    Decisions
         Every member that the numbers allow to ask is undetermined where something stands in its way.
 
     Notes
     -----
     method.md section 7. Run, calibrate, explain, demo, and all that decide a finished run again call this.
     """
-    found = _misfit(diagnostics, settings)
-    blocked = diagnostics.unusable or _all_behind(diagnostics)
-    if blocked is not None:
-        asked = [member for member in Member if member is not Member.OUTSIDE]
-        members: dict[Member, Judgement] = {
-            m: Judgement(Verdict.UNDETERMINED, (replace(blocked, member=m),)) for m in asked
-        }
-    else:
-        camera, outside = judge_camera(diagnostics, settings), judge_outside(diagnostics, settings)
-        members = {
-            Member.MISFIT: judge_misfit(diagnostics, found, settings),
-            **({} if camera is None else {Member.CAMERA: camera}),
-            Member.POSE: judge_pose(diagnostics, settings),
-            Member.PLAUSIBLE: _without_k1_remark(judge_plausible(diagnostics, settings), camera),
-            Member.NOISE: judge_noise(diagnostics, settings),
-            Member.KS: judge_ks(diagnostics, settings),
-            **({} if outside is None else {Member.OUTSIDE: outside}),
-        }
-    pose_first = pose_alone(diagnostics.gains)
-    judgement = judgement_under(members, settings.policy, pose_first=pose_first)
-    severity = severity_of(members, found, diagnostics.misfit)
-    return Decision(members, judgement, found, severity, pose_first)
+    tau_px = taus_px(settings, measured.misfit.sigma_px)
+    found = decide_misfits(measured.misfit, alpha=settings.alpha, tau_px=tau_px)
+    camera = judge_camera(measured, settings)
+    judged = {
+        Member.MISFIT: judge_misfit(measured, found, settings),
+        Member.CAMERA: camera,
+        Member.POSE: judge_pose(measured, settings),
+        Member.PLAUSIBLE: _without_k1_remark(judge_plausible(measured, settings), camera),
+        Member.NOISE: judge_noise(measured, settings),
+        Member.KS: judge_ks(measured, settings),
+        Member.OUTSIDE: judge_outside(measured, settings),
+    }
+    blocked = _blocked(measured)
+    members = {member: _unless(blocked, member, judged[member]) for member in MEMBERS} if blocked else judged
+    severity = severities_of(members, found.worth)
+    return Decisions(members, found, severity, pose_alone(measured.gains), settings.policy)
 
 
-def judgement_under(members: Mapping[Member, Judgement], policy: PolicyName, *, pose_first: bool) -> Judgement:
-    """Return rejected if any member rejects, else undetermined if any is, else accepted; each reason once."""
-    order = list(POLICIES[policy])
-    if pose_first and Member.POSE in order:
-        order.remove(Member.POSE)
-        order.insert(0, Member.POSE)
-    deciding = [members[member] for member in order if member in members]
-    reasons: dict[str, Reason] = {}
-    for reason in (reason for each in deciding for reason in each.reasons):
-        reasons.setdefault(str(reason), reason)
-    return Judgement(strongest(each.verdict for each in deciding), tuple(reasons.values()))
+def _blocked(measured: Measured) -> dict[int, Reason]:
+    """By row the reason that stands in the way of every question: nothing can be projected, or hardly anything."""
+    parts = measured.parts
+    behind = {
+        row: Reason(ReasonCode.POINTS_BEHIND, Member.CAMERA, parts.texts.get(row, ""))
+        for row in np.flatnonzero(parts.all_behind).tolist()
+    }
+    return {**behind, **measured.unusable}
 
 
-def _without_k1_remark(plausible: Judgement, camera: Judgement | None) -> Judgement:
+def _unless(blocked: dict[int, Reason], member: Member, judged: Judged) -> Judged:
+    """Leave open what nobody can answer; witnesses outside are not asked then."""
+    free: BoolArray = np.ones(len(judged.verdict), dtype=bool)
+    free[list(blocked)] = False
+    left = judged.of_those(free)
+    if member is Member.OUTSIDE:
+        return left
+    reasons = {row: [replace(reason, member=member)] for row, reason in blocked.items()}
+    verdict = np.where(free, left.verdict, VERDICT_ORDER[Verdict.UNDETERMINED])
+    return Judged(verdict, (*left.said, *said_of(reasons, member)))
+
+
+def _without_k1_remark(plausible: Judged, camera: Judged) -> Judged:
     """Leave out that k1 is small where the camera is rejected: a k1 frozen at 0 is wrong, not superfluous."""
-    if camera is None or camera.verdict is not Verdict.REJECTED:
-        return plausible
-    kept = tuple(reason for reason in plausible.reasons if reason.code is not ReasonCode.K1_NOT_IDENTIFIED)
-    return replace(plausible, reasons=kept)
-
-
-def _all_behind(diagnostics: Diagnostics) -> Reason | None:
-    """Nothing can be projected, or hardly anything: the reason that stands in the way of every question."""
-    consistency = diagnostics.consistency
-    if consistency is None or not consistency.all_behind:
-        return None
-    return Reason(ReasonCode.POINTS_BEHIND, Member.CAMERA, consistency.text)
-
-
-def _misfit(diagnostics: Diagnostics, settings: AuditConfig) -> MisfitDecision | None:
-    misfit = diagnostics.misfit
-    if misfit is None:
-        return None
-    return decide_misfit(misfit.groups, alpha=settings.alpha, tau_px=settings.tau_px(misfit.sigma_px))
+    kept = camera.verdict != VERDICT_ORDER[Verdict.REJECTED]
+    said = (each.only(kept) if each.code is ReasonCode.K1_NOT_IDENTIFIED else each for each in plausible.said)
+    return replace(plausible, said=tuple(each for each in said if each.rows.size))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from sfm_audit.audit.misfit import MisfitTests, bic
 from sfm_audit.audit.table.witnesses import WitnessStatement
-from sfm_audit.audit.table.words import GROUPS, LENS_GROUPS, MisfitGroup, MisfitStatus, Reason
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus, Reason
 from sfm_audit.loaders.arrays import FloatArray
 
 
@@ -100,11 +100,6 @@ class MisfitDiagnostics:
     sigma_px: float
     shared: SharedMisfit | None = None
 
-    @property
-    def num_lens_groups(self) -> int:
-        """How many groups of the lens could be tested."""
-        return sum(self.groups[group].status is MisfitStatus.TESTED for group in LENS_GROUPS)
-
 
 @dataclass(frozen=True, slots=True)
 class CameraDiagnostics:
@@ -130,13 +125,6 @@ class CameraDiagnostics:
     k1: float | None
     sd_k1: float
     is_joint: bool = False
-
-    @property
-    def principal_point_outside(self) -> bool:
-        """Whether the principal point lies outside the image."""
-        if self.principal_point_px is None:
-            return False
-        return not all(0.0 <= at <= size for at, size in zip(self.principal_point_px, self.size_px, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

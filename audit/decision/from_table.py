@@ -15,19 +15,16 @@ import numpy as np
 import pyarrow as pa
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.columns import (
-    CAUSE_COLUMNS,
-    VERDICT_COLUMNS,
-    WORTH_COLUMNS,
-    cause_columns,
-    verdict_columns,
-    worth_columns,
-)
-from sfm_audit.audit.decision.decide import Decision, decide
+from sfm_audit.audit.decision.columns import CAUSE_COLUMNS, VERDICT_COLUMNS, WORTH_COLUMNS, decision_columns
+from sfm_audit.audit.decision.decide import decide_all
+from sfm_audit.audit.decision.decisions import Decisions
 from sfm_audit.audit.decision.diagnostics import Diagnostics
 from sfm_audit.audit.decision.from_row import READ_COLUMNS, diagnostics_of_row, number_of
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.table import build_table
-from sfm_audit.audit.table.words import GROUPS, Member, MisfitStatus, Verdict
+from sfm_audit.audit.table.arrow import Column
+from sfm_audit.audit.table.words import GROUPS, Member, MisfitStatus
+from sfm_audit.loaders.arrays import BoolArray
 
 Row = Mapping[str, Any]
 
@@ -91,19 +88,13 @@ def redecide(images: pa.Table, settings: AuditConfig, *, run: AuditConfig) -> pa
     _check_effect(rows, settings, run)
     of_run = [diagnostics_of_row(row) for row in rows]
     found = _without_stale_shared(rows, of_run, settings)
-    decisions = [decide(each, settings) for each in found]
-    before = decisions if settings == run else [decide(each, run) for each in of_run]
+    decisions = decide_all(Measured.of(found), settings)
+    before = decisions if settings == run else decide_all(Measured.of(of_run), run)
     same_limits = (settings.alpha, settings.min_effect) == (run.alpha, run.min_effect)
-    written = [
-        {
-            **cause_columns(decision.misfit),
-            **worth_columns(decision.misfit, each.misfit, number_of(row["sigma_constant_px"])),
-            _ADVICE: row[_ADVICE] if _same_advice(decision, was, same_limits=same_limits) else None,
-            **verdict_columns(decision),
-        }
-        for row, each, decision, was in zip(rows, found, decisions, before, strict=True)
-    ]
-    return _replaced(images, written)
+    same = _same_advice(decisions, before, same_limits=same_limits).tolist()
+    sigma_px = np.array([number_of(row["sigma_constant_px"]) for row in rows], dtype=np.float64)
+    advice = [row[_ADVICE] if holds else None for row, holds in zip(rows, same, strict=True)]
+    return _replaced(images, {**decision_columns(decisions, sigma_px), _ADVICE: advice})
 
 
 def redecide_cameras(cameras: pa.Table, images: pa.Table, settings: AuditConfig, *, run: AuditConfig) -> pa.Table:
@@ -206,24 +197,21 @@ def _effect_px(diagnostics: Diagnostics, settings: AuditConfig) -> float:
     return max((test.px for test in misfit.groups.values() if test.q < settings.alpha), default=0.0)
 
 
-def _same_advice(decision: Decision, before: Decision, *, same_limits: bool) -> bool:
-    """Whether what the advice rests on is the same: what was tried to repair a misfit depends on alpha and tau."""
-    if decision is before:
-        return True
-
-    def basis(each: Decision) -> tuple[object, ...]:
-        material = each.misfit.material if each.misfit else None
-        rejects = any(judgement.verdict is Verdict.REJECTED for judgement in each.members.values())
-        return each.misfit and each.misfit.group, material, rejects, each.of(Member.MISFIT)
-
-    repaired = decision.misfit is not None and bool(decision.misfit.material)
-    return basis(decision) == basis(before) and (same_limits or not repaired)
+def _same_advice(decisions: Decisions, before: Decisions, *, same_limits: bool) -> BoolArray:
+    """(n,) whether what the advice rests on is the same: what was tried to repair a misfit depends on alpha and tau."""
+    if decisions is before:
+        return np.ones(len(decisions), dtype=bool)
+    misfit, was = decisions.misfit, before.misfit
+    same = (misfit.cause == was.cause) & (misfit.material == was.material).all(axis=1)
+    same &= decisions.rejects == before.rejects
+    same &= decisions.members[Member.MISFIT].verdict == before.members[Member.MISFIT].verdict
+    return np.asarray(same & (same_limits | ~misfit.material.any(axis=1)))
 
 
-def _replaced(images: pa.Table, written: Sequence[Mapping[str, object]]) -> pa.Table:
+def _replaced(images: pa.Table, written: Mapping[str, Column]) -> pa.Table:
     """Return the table with these columns replaced, in place."""
     wanted = pa.schema([images.schema.field(name) for name in _WRITTEN])
-    fresh = build_table({name: [row[name] for row in written] for name in _WRITTEN}, wanted)
+    fresh = build_table({name: written[name] for name in _WRITTEN}, wanted)
     for name in _WRITTEN:
         at = images.column_names.index(name)
         images = images.set_column(at, images.schema.field(at), fresh.column(name))

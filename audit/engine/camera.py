@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.camera_quality.measure import CameraQuality
-from sfm_audit.audit.decision.decide import Decision
+from sfm_audit.audit.decision.decisions import Decisions
 from sfm_audit.audit.decision.diagnostics import misfit_groups
 from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
 from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
@@ -34,7 +34,7 @@ from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, camera_tests_i
 from sfm_audit.audit.misfit.pooled import camera_tests_of_pieces
 from sfm_audit.audit.misfit.pooled_stack import in_windows, pieces_of_joined
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
-from sfm_audit.audit.table.words import Member, Verdict
+from sfm_audit.audit.table.words import VERDICT_ORDER, Member, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel
 
@@ -232,37 +232,57 @@ def _distortion_identified(quality: Sequence[CameraQuality | None], min_sds: flo
     return False
 
 
-def settled(camera: CameraAudit, decisions: Sequence[Decision]) -> CameraAudit:
+def settled(camera: CameraAudit, rejected: BoolArray) -> CameraAudit:
     """Return the camera without the advice that less would do where half of its images or more are rejected.
 
     Parameters
     ----------
-    decisions : of all images of the model, in their order
+    rejected : (I,) images of the model that the policy ``camera`` rejects
     """
-    said = [decisions[int(i)].under("camera").verdict for i in camera.image_idxs]
-    if camera.misfit.material or 2 * said.count(Verdict.REJECTED) < len(said):
+    if camera.misfit.material or 2 * np.count_nonzero(rejected[camera.image_idxs]) < len(camera.image_idxs):
         return camera
     return replace(camera, advised_camera_model=None)
 
 
-def image_advice(quality: CameraQuality, decision: Decision, retest: Retest, *, alpha: float) -> str | None:
-    """Return the camera model that one image asks for; ``retest`` of its points and residuals.
+def is_advisable(decisions: Decisions) -> BoolArray:
+    """(n,) images whose decision allows to advise a camera model.
 
     No lens is advised where the parts do not belong together, and no smaller one where any question rejects or the
     misfit could not be asked for.
     """
-    misfit = decision.misfit
-    rejects = any(judgement.verdict is Verdict.REJECTED for judgement in decision.members.values())
-    if misfit is None or decision.of(Member.MISFIT) is Verdict.UNDETERMINED:
-        return None
-    if bool(misfit.material) != (decision.of(Member.MISFIT) is Verdict.REJECTED) or (rejects and not misfit.material):
-        return None
-    return advised_camera_model(
-        quality.shape.camera,
-        misfit.group if misfit.material else None,
-        misfit.material,
-        retest=retest,
-        distortion_identified=_distortion_identified([quality]),
-        alpha=alpha,
-        tau_px=misfit.tau_px,
-    )
+    said, material = decisions.members[Member.MISFIT].verdict, decisions.misfit.material.any(axis=1)
+    asked = decisions.misfit.measured.known & (said != VERDICT_ORDER[Verdict.UNDETERMINED])
+    agree = material == (said == VERDICT_ORDER[Verdict.REJECTED])
+    return np.asarray(asked & agree & (material | ~decisions.rejects))
+
+
+def images_advice(
+    qualities: Sequence[CameraQuality | None],
+    decisions: Decisions,
+    retest: Callable[[int, CameraRecord], MisfitTests] | None,
+    *,
+    alpha: float,
+) -> list[str | None]:
+    """Return the camera models that n images ask for, None where none is advised.
+
+    Parameters
+    ----------
+    retest : the misfit tests of the image in a row under another camera
+    """
+    out: list[str | None] = [None] * len(qualities)
+    material: BoolArray = np.asarray(decisions.misfit.material.any(axis=1))
+    for i in np.flatnonzero(is_advisable(decisions)).tolist():
+        quality = qualities[i]
+        if quality is None:
+            continue
+        found = decisions.misfit.record(i) if material[i] else None
+        out[i] = advised_camera_model(
+            quality.shape.camera,
+            found.group if found else None,
+            found.material if found else (),
+            retest=None if retest is None else partial(retest, i),
+            distortion_identified=_distortion_identified([quality]),
+            alpha=alpha,
+            tau_px=float(decisions.misfit.tau_px[i]),
+        )
+    return out

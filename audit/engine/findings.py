@@ -8,31 +8,24 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.consistency import ModelConsistency, rounded_decimals
-from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, stale_finding
 from sfm_audit.audit.joint import JointAudit
 from sfm_audit.audit.noise.standardise import ModelTracks
-from sfm_audit.audit.table.words import ReasonCode
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
 _REMOVABLE_SHARE: Final = 0.05  # of the squared residuals: above it the 3D points are not at their optimum
 
 
-def residual_findings(
-    stored: StoredErrors, tracks: ModelTracks, num_points: int, decisions: Sequence[Decision]
-) -> list[Finding]:
+def residual_findings(stored: StoredErrors, tracks: ModelTracks, num_points: int, num_exact: int) -> list[Finding]:
     """Return the findings that need residuals.
 
     Parameters
     ----------
     stored : stored point errors beside recomputed ones          tracks : of all inliers of the model
-    num_points : 3D points          decisions : of the images; some say that their 2D points are no measurements
+    num_points : 3D points          num_exact : images whose 2D points are no measurements
     """
     statistics = tracks.statistics
-    num_exact = sum(
-        any(reason.code is ReasonCode.EXACT_PROJECTIONS for reason in decision.all_reasons) for decision in decisions
-    )
     found = [stale_finding(stored)]
     if num_exact:
         text = (

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from functools import partial
 
 import numpy as np
 
 from sfm_audit.audit.camera_quality.measure import CameraQuality, CameraShape, camera_quality
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import Decision, decide
+from sfm_audit.audit.decision.decide import decide_all
+from sfm_audit.audit.decision.decisions import Decision
 from sfm_audit.audit.decision.diagnostics import (
     CameraDiagnostics,
     ConsistencyDiagnostics,
@@ -22,23 +23,20 @@ from sfm_audit.audit.decision.diagnostics import (
     OwnDiagnostics,
     misfit_groups,
 )
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.decision.misfit import MisfitDecision
-from sfm_audit.audit.engine.camera import image_advice
+from sfm_audit.audit.engine.camera import images_advice
 from sfm_audit.audit.inliers.projected import inliers_of
-from sfm_audit.audit.inliers.residuals import ModelResiduals, image_residuals, longest_px
+from sfm_audit.audit.inliers.residuals import image_residuals, longest_px
 from sfm_audit.audit.inliers.sanity import is_sane, is_usable
-from sfm_audit.audit.misfit import Retest, image_retest
+from sfm_audit.audit.misfit import MisfitTests, Retest, image_retest
 from sfm_audit.audit.misfit.significance import Significance
-from sfm_audit.audit.noise.stack import constant_noises, track_noises
-from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise
-from sfm_audit.audit.normality import NormalityTests, normality_tests, normality_tests_of
+from sfm_audit.audit.noise.standardise import ImageNoise, constant_noise
+from sfm_audit.audit.normality import NormalityTests, normality_tests
 from sfm_audit.audit.table.witnesses import WitnessStatement
 from sfm_audit.audit.table.words import Member, Reason, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import FloatArray, Int32Array
-from sfm_audit.loaders.model import ImageRecord, InlierSet
-
-_MAX_VALUES_AT_ONCE: Final = 1 << 16
-_MAX_IMAGES_AT_ONCE: Final = 512
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,68 +188,15 @@ def audit_inliers(inliers: InlierSet, config: AuditConfig | None = None) -> Imag
     return audit_image(evidence, config)
 
 
-KnownOf = Callable[[int, ImageNoise | None, ImageNoise | None], ImageEvidence]
-"""Given an image's row, its noise of one scale and under the chosen noise model, each None where not at hand."""
-
-
-def audit_images(
-    known: KnownOf, image_idxs: range, residuals: ModelResiduals, tracks: ModelTracks | None, config: AuditConfig
-) -> Iterator[ImageAudit]:
-    """Audit some images of a model; those with few observations are fitted and tested together, some at once.
-
-    Parameters
-    ----------
-    known : what is known of an image        tracks : where the chosen noise model is ``track``, else None
-    """
-    waiting: list[ImageEvidence] = []
-    num_values = 0
-    for evidence in _evidence_of(known, image_idxs, residuals, tracks):
-        waiting.append(evidence)
-        num_values += evidence.constant.z.size
-        if num_values > _MAX_VALUES_AT_ONCE or len(waiting) == _MAX_IMAGES_AT_ONCE:
-            yield from _audited_together(waiting, config)
-            waiting, num_values = [], 0
-    yield from _audited_together(waiting, config)
-
-
-def _evidence_of(
-    known: KnownOf, image_idxs: range, residuals: ModelResiduals, tracks: ModelTracks | None
-) -> Iterator[ImageEvidence]:
-    """Yield what is known of each image; the noise of those with few observations is fitted together."""
-    for start in range(0, len(image_idxs), _MAX_IMAGES_AT_ONCE):
-        part = image_idxs[start : start + _MAX_IMAGES_AT_ONCE]
-        constant = constant_noises(residuals, part)
-        sigma_px = {image: noise.sigma_constant_px for image, noise in constant.items()}
-        chosen = {} if tracks is None else track_noises(tracks, part, sigma_px)
-        for image in part:
-            yield known(image, constant.get(image), chosen.get(image))
-
-
-def _audited_together(images: Sequence[ImageEvidence], config: AuditConfig) -> Iterator[ImageAudit]:
-    of_chosen = normality_tests_of([evidence.chosen.z for evidence in images])
-    of_constant = of_chosen
-    if any(evidence.chosen is not evidence.constant for evidence in images):
-        of_constant = normality_tests_of([evidence.constant.z for evidence in images])
-    for evidence, tests, constant_tests in zip(images, of_chosen, of_constant, strict=True):
-        yield _audited(evidence, tests, constant_tests, config)
-
-
 def audit_image(evidence: ImageEvidence, config: AuditConfig) -> ImageAudit:
     """Test the standardised residuals of the chosen and of the constant noise model, and decide."""
-    tests = normality_tests(evidence.chosen.z)
-    is_one = evidence.chosen is evidence.constant
-    return _audited(evidence, tests, tests if is_one else normality_tests(evidence.constant.z), config)
-
-
-def _audited(
-    evidence: ImageEvidence, tests: NormalityTests, constant_tests: NormalityTests, config: AuditConfig
-) -> ImageAudit:
     chosen, constant, quality = evidence.chosen, evidence.constant, evidence.quality
+    tests = normality_tests(chosen.z)
     diagnostics = _diagnostics(evidence, tests)
-    decision = decide(diagnostics, config)
+    decisions = decide_all(Measured.of([diagnostics]), config)
     advice = None
-    if quality is not None and decision.misfit is not None and evidence.retest is not None:
-        advice = image_advice(quality, decision, evidence.retest, alpha=config.alpha)
+    if evidence.retest is not None:
+        (advice,) = images_advice([quality], decisions, partial(_retested, evidence.retest), alpha=config.alpha)
     return ImageAudit(
         inliers=evidence.inliers,
         residuals_px=evidence.residuals_px.T,
@@ -259,16 +204,20 @@ def _audited(
         noise=chosen,
         tests=tests,
         constant=constant,
-        constant_tests=constant_tests,
+        constant_tests=tests if chosen is constant else normality_tests(constant.z),
         quality=quality,
         diagnostics=diagnostics,
-        decision=decision,
+        decision=decisions.decision(0),
         advised_camera_model=advice,
         expected_error_px=evidence.expected_error_px,
         implied=evidence.implied,
         outside=evidence.outside,
         pose=evidence.pose,
     )
+
+
+def _retested(retest: Retest, _: int, camera: CameraRecord) -> MisfitTests:
+    return retest(camera)
 
 
 def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
@@ -282,7 +231,7 @@ def _diagnostics(evidence: ImageEvidence, tests: NormalityTests) -> Diagnostics:
         camera=evidence.camera or (None if evidence.quality is None else camera_diagnostics(evidence.quality)),
         largest_residual_px=longest_px(evidence.residuals_px),
         longer_side_px=0 if camera is None else max(camera.width, camera.height),
-        unusable=_unusable(evidence.inliers.image),
+        unusable=unusable_reason(evidence.inliers.image),
         consistency=evidence.consistency,
         own=evidence.own,
         has_own=evidence.has_own,
@@ -311,7 +260,7 @@ def camera_diagnostics(quality: CameraQuality) -> CameraDiagnostics:
     )
 
 
-def _unusable(image: ImageRecord) -> Reason | None:
+def unusable_reason(image: ImageRecord) -> Reason | None:
     """What makes it impossible to project any point."""
     pose = np.concatenate([image.quat_cam_from_world_wxyz, image.translation_cam_from_world])
     num_odd = int(np.count_nonzero(~np.isfinite(pose)))

@@ -128,12 +128,13 @@ _IMPLIED_COLUMNS: Final[dict[Implied, tuple[str, ...]]] = {
 }
 
 
-def implied_of(found: Sequence[ImpliedParameter], camera_idx: int) -> dict[str, float]:
-    """Return by column by how much parameters that nobody freed would change, each alone, and the sd of that."""
-    out: dict[str, float] = {}
+def implied_by_camera(found: Sequence[ImpliedParameter]) -> dict[int, dict[str, float]]:
+    """Return by camera and column by how much parameters that nobody freed would change, each alone, and the sd."""
+    out: dict[int, dict[str, float]] = {}
     for one in found:
-        if one.camera_idx != camera_idx:
+        if one.camera_idx is None:
             continue
+        own = out.setdefault(one.camera_idx, {})
         for k, name in enumerate(_IMPLIED_COLUMNS[one.parameter]):
-            out[name], out[f"{name}_sd"] = float(one.step[k]), float(one.sd[k])
+            own[name], own[f"{name}_sd"] = float(one.step[k]), float(one.sd[k])
     return out

@@ -13,9 +13,8 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
-from sfm_audit.audit.decision.decide import Decision
 from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
-from sfm_audit.audit.decision.triage import triage
+from sfm_audit.audit.decision.triage import CAMERA_COLUMNS, triage
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
 from sfm_audit.audit.engine.findings import (
     consistency_findings,
@@ -24,12 +23,13 @@ from sfm_audit.audit.engine.findings import (
     pose_findings,
     residual_findings,
 )
-from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, audit_images, camera_diagnostics
+from sfm_audit.audit.engine.image import ImageAudit, ImageEvidence, audit_image, camera_diagnostics
+from sfm_audit.audit.engine.images import audit_images
 from sfm_audit.audit.engine.jointly import (
     consistency_diagnostics,
     expected_error_px,
     gains_of,
-    implied_of,
+    implied_by_camera,
     joint_camera,
     misfit_diagnostics,
     own_diagnostics,
@@ -38,8 +38,8 @@ from sfm_audit.audit.engine.jointly import (
 )
 from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.quality import quality_of_images
-from sfm_audit.audit.engine.rows import Row, camera_row, image_row, model_row
-from sfm_audit.audit.engine.tables import ModelAudit, images_table, table_of
+from sfm_audit.audit.engine.rows import camera_columns, model_row
+from sfm_audit.audit.engine.tables import ModelAudit, Said, images_table, triage_rows
 from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
@@ -49,7 +49,7 @@ from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
 from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
-from sfm_audit.audit.table import ModelLabels
+from sfm_audit.audit.table import ModelLabels, build_table, schema
 from sfm_audit.audit.table.words import MisfitStatus
 from sfm_audit.audit.witnesses.asking import Outside, ask
 from sfm_audit.audit.witnesses.evidence import Evidence
@@ -197,6 +197,11 @@ class ModelAuditor:
         return {} if self.joint is None else {step.camera_idx: step for step in self.joint.steps}
 
     @cached_property
+    def implied(self) -> dict[int, dict[str, float]]:
+        """By row of the camera table and column: changes that parameters which nobody freed would take."""
+        return {} if self.joint is None else implied_by_camera(self.joint.implied)
+
+    @cached_property
     def cameras(self) -> list[CameraAudit]:
         """Every camera that has an image with inliers."""
         return audit_cameras(
@@ -217,16 +222,16 @@ class ModelAuditor:
         if self.joint is None or self.consistency.inconsistent[image_idx]:
             rows = self.residuals.rows(image_idx)
             return untested_misfit(rows.stop - rows.start, sigma_px, MisfitStatus.EXCLUDED)
-        shared = self._shared_misfit(image_idx) if self.joint.misfit.most_are_wrong else None
+        shared = self.shared_misfit(image_idx) if self.joint.misfit.most_are_wrong else None
         return misfit_diagnostics(self.joint, image_idx, sigma_px, shared)
 
-    def _retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
-        """The misfit tests of the image if it had been fitted with this camera, to first order."""
+    def retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
+        """Return the misfit tests of the image if it had been fitted with this camera, to first order."""
         own = image_inliers(self.model, self.residuals, image_idx)
         return image_retest(own.xyz_cam, own.residuals_px)(camera)
 
-    def _shared_misfit(self, image_idx: int) -> SharedMisfit | None:
-        """What the image's camera shows as a whole, if several images share it and together find a material misfit."""
+    def shared_misfit(self, image_idx: int) -> SharedMisfit | None:
+        """Return what the image's camera shows as a whole, if its images together find a material misfit."""
         camera_id = int(self.model.images.camera_id[image_idx])
         camera = next((c for c in self.cameras if c.camera.camera_id == camera_id), None)
         if camera is None or len(camera.image_idxs) < 2 or not camera.misfit.material or camera.misfit.group is None:
@@ -248,23 +253,21 @@ class ModelAuditor:
         image_idx = self.model.image_idx(image) if isinstance(image, str) else image
         return audit_image(self.evidence(image_idx), self.config)
 
-    def evidence(
-        self, image_idx: int, constant: ImageNoise | None = None, chosen: ImageNoise | None = None
-    ) -> ImageEvidence:
-        """Return what is known of an image before anything is decided, given its row; its noise where at hand."""
+    def evidence(self, image_idx: int) -> ImageEvidence:
+        """Return what is known of an image before anything is decided, given its row."""
         rows = self.residuals.rows(image_idx)
         residuals_px = self.residuals.residuals_px[:, rows]
-        constant = constant or constant_noise(residuals_px)
+        constant = constant_noise(residuals_px)
         return ImageEvidence(
             self.inliers(image_idx),
             residuals_px,
             float(self.residuals.pose_offset_px[image_idx]),
             constant,
-            chosen or self._noise(image_idx, constant),
+            self.noise(image_idx, constant),
             track_length=self.tracks.statistics.track_length[rows],
             quality=self.quality[image_idx],
             misfit=self.misfit(image_idx),
-            retest=partial(self._retest, image_idx),
+            retest=partial(self.retest, image_idx),
             consistency=consistency_diagnostics(
                 self.consistency.images[image_idx], all_behind=self.consistency.points_behind
             ),
@@ -290,12 +293,12 @@ class ModelAuditor:
             "gains": gains_of(joint, image_idx),
             "camera": joint_camera(camera_diagnostics(quality), quality, step),
             "expected_error_px": expected_error_px(quality, joint.covariances[image_idx], sigma_px),
-            "implied": implied_of(joint.implied, step.camera_idx),
+            "implied": self.implied.get(step.camera_idx, {}),
             "pose": pose_columns(joint, image_idx, self.model.images.name),
         }
 
-    def _noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
-        """The image's noise under the chosen model."""
+    def noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise:
+        """Return the image's noise under the chosen model, given its row and its noise of one scale."""
         match self.config.noise:
             case "constant":
                 return constant
@@ -307,7 +310,7 @@ class ModelAuditor:
     def standardised(self, image_idx: int) -> tuple[IntArray, FloatArray]:
         """Return which of the image's inliers (m,) the noise model standardises, and their z (m, 2)."""
         rows = self.residuals.rows(image_idx)
-        noise = self._noise(image_idx, constant_noise(self.residuals.residuals_px[:, rows]))
+        noise = self.noise(image_idx, constant_noise(self.residuals.residuals_px[:, rows]))
         match self.config.noise:
             case "constant":
                 used = np.arange(rows.stop - rows.start)
@@ -324,10 +327,6 @@ class ModelAuditor:
         length = self.tracks.statistics.track_length
         return observation_table(self.model, self.residuals, length, self.standardised, labels or self._own_labels)
 
-    def _camera_row(self, camera: CameraAudit, labels: ModelLabels) -> Row:
-        camera_idx = int(self.model.images.camera_idx[camera.image_idxs[0]])
-        return camera_row(camera, labels, self.steps.get(camera_idx), self.joint)
-
     @property
     def _own_labels(self) -> ModelLabels:
         return ModelLabels("", "", "0", self.model.location)
@@ -337,19 +336,23 @@ class ModelAuditor:
         labels = labels or self._own_labels
         _ = self.joint, self.cameras, self.tracks, self.outside  # before the images are spread
         _ = self.config.noise == "keypoint" and self.keypoint_tracks
-        images = self._spread(partial(_images_of, labels=labels), self)
-        rows, decisions = [row for row, _ in images], [decision for _, decision in images]
-        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), decisions)
+        parts = self._spread(partial(audit_images, labels=labels), self)
+        said = Said.together([part.said for part in parts])
+        own_findings = residual_findings(self.stored_errors, self.tracks, len(self.model.points), said.num_exact)
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
-        cameras = [self._camera_row(settled(camera, decisions), labels) for camera in self.cameras]
-        asked = self.outside.witnesses
-        row = model_row(self.model, labels, self.tracks, self.stored_errors, findings, decisions, asked)
-        row["diagnoses"] = triage(rows, cameras, labels.model_path, parts_disagree=parts_disagree(findings))
+        audits = [settled(camera, said.camera_rejected) for camera in self.cameras]
+        cameras = camera_columns(self.model, audits, labels, self.joint, self.implied)
+        row = model_row(
+            self.model, labels, self.tracks, self.stored_errors, findings, said.counts, self.outside.witnesses
+        )
+        rows = [row for part in parts for row in part.triage_rows]
+        of_cameras = triage_rows(cameras, CAMERA_COLUMNS)
+        row["diagnoses"] = triage(rows, of_cameras, labels.model_path, parts_disagree=parts_disagree(findings))
         return ModelAudit(
-            images_table(rows, self.config.column_groups),
-            table_of("cameras", cameras),
-            table_of("models", [row]),
+            images_table(parts, self.config.column_groups),
+            build_table(cameras, schema("cameras")),
+            build_table({name: [value] for name, value in row.items()}, schema("models")),
             self.observations(labels) if observations else None,
         )
 
@@ -390,10 +393,3 @@ def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality 
     """What some images say of their cameras."""
     sigma_px = auditor.sigma_constant_px
     return quality_of_images(auditor.model, auditor.residuals, sigma_px, image_idxs, grid=auditor.config.grid)
-
-
-def _images_of(auditor: ModelAuditor, image_idxs: range, labels: ModelLabels) -> list[tuple[Row, Decision]]:
-    """Rows of the image table and decisions about some images."""
-    tracks = auditor.tracks if auditor.config.noise == "track" else None
-    audits = audit_images(auditor.evidence, image_idxs, auditor.residuals, tracks, auditor.config)
-    return [(image_row(audit, labels, auditor.config.noise), audit.decision) for audit in audits]

@@ -17,27 +17,50 @@ import pyarrow as pa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coded:
-    """A column of few different texts: ``names[codes[i]]`` in row i; ``codes`` are int32."""
+    """A column of few different texts: ``names[codes[i]]`` in row i; None there is null."""
 
-    codes: npt.NDArray[np.int32]
-    names: Sequence[str]
+    codes: npt.NDArray[Any]
+    names: Sequence[str | None]
 
     def __len__(self) -> int:
         return len(self.codes)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Listed:
+    """A column of lists: row i holds ``items[offsets[i]:offsets[i + 1]]``, or null where ``known`` (n,) says so."""
+
+    offsets: npt.NDArray[Any]
+    items: Column
+    known: npt.NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Structs:
+    """A column of structs, field by field."""
+
+    fields: Mapping[str, Column]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.fields.values())))
+
+
 _FLOATS: Final = frozenset({float, np.float64, type(None)})
 Values = npt.NDArray[Any] | Sequence[Any]
+Column = Values | Coded | Listed | Structs
 
 
-def build_table(columns: Mapping[str, Values | Coded], wanted: pa.Schema) -> pa.Table:
+def build_table(columns: Mapping[str, Column], wanted: pa.Schema) -> pa.Table:
     """Build an Arrow table of a given schema.
 
     Parameters
     ----------
     columns : one entry per field of the schema, all of one length. Numbers and booleans: an array, a masked array or
-        a sequence that may hold None. Text: a sequence of str or None; dictionaries of text: `Coded`. Lists: a sequence
-        of sequences or None; elements of a list of structs are objects with the struct's fields as attributes.
+        a sequence that may hold None. Text: a sequence of str or None, or `Coded`; dictionaries of text: `Coded`.
+        Lists: `Listed`, or a sequence of sequences or None. Structs: `Structs`, or objects with the same attributes.
     wanted : the schema, for instance ``audit.table.schema("images")``
 
     Returns
@@ -63,21 +86,23 @@ def build_table(columns: Mapping[str, Values | Coded], wanted: pa.Schema) -> pa.
     return pa.Table.from_arrays(arrays, schema=wanted)
 
 
-def _build_column(values: Values | Coded, field: pa.Field[Any]) -> pa.Array[Any]:
+def _build_column(values: Column, field: pa.Field[Any]) -> pa.Array[Any]:
     try:
-        return _coded_array(values, field.type) if isinstance(values, Coded) else _build_array(values, field.type)
+        return _build_array(values, field.type)
     except (TypeError, ValueError) as error:
         raise type(error)(f"column {field.name}: {error}") from error
 
 
-def _build_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
-    if pa.types.is_string(kind):
-        return _text_array(values)
+def _build_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
+    if isinstance(values, Coded):
+        return _coded_array(values, kind)
     if pa.types.is_list(kind):
         return _list_array(values, kind)
     if pa.types.is_struct(kind):
         return _struct_array(values, kind)
-    return _number_array(values, kind)
+    if isinstance(values, Listed | Structs):
+        raise TypeError(f"expected {kind}, found {type(values).__name__}")
+    return _text_array(values) if pa.types.is_string(kind) else _number_array(values, kind)
 
 
 def _number_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
@@ -110,47 +135,75 @@ def _split_missing(values: Values, dtype: np.dtype[Any]) -> tuple[npt.NDArray[An
 
 
 def _text_array(values: Values) -> pa.Array[Any]:
+    distinct: dict[Any, int] = {}
+    codes = [distinct.setdefault(value, len(distinct)) for value in values]
+    return _taken(np.array(codes, dtype=np.int64), list(distinct))
+
+
+def _taken(codes: npt.NDArray[Any], names: Sequence[Any]) -> pa.Array[Any]:
+    """Return the text ``names[codes[i]]`` in row i; what is None there is null."""
     # a name that is not valid Unicode (lone surrogates) is shown by its code, because Parquet text is UTF-8
-    encoded = [None if value is None else str(value).encode(errors="backslashreplace") for value in values]
-    offsets = _offsets([0 if text is None else len(text) for text in encoded])
-    data = pa.py_buffer(b"".join(text for text in encoded if text is not None))
-    valid = np.array([text is not None for text in encoded], dtype=bool)
-    return pa.Array.from_buffers(pa.string(), len(encoded), [_validity(valid), offsets, data])
+    encoded = [b"" if name is None else str(name).encode(errors="backslashreplace") for name in names]
+    lengths = np.array([len(text) for text in encoded], dtype=np.int64)
+    data = b"".join(map(encoded.__getitem__, codes.tolist()))
+    known = np.array([name is not None for name in names], dtype=bool)
+    buffers = [_validity(known[codes]), _offsets(lengths[codes]), pa.py_buffer(data)]
+    return pa.Array.from_buffers(pa.string(), len(codes), buffers)
 
 
 def _coded_array(values: Coded, kind: pa.DataType) -> pa.Array[Any]:
+    if pa.types.is_string(kind):
+        return _taken(values.codes, values.names)
     if not isinstance(kind, pa.DictionaryType):
         raise TypeError(f"expected {kind}, found codes and names")
     buffers = [None, _buffer(values.codes.astype(np.int32, copy=False))]
     return pa.DictionaryArray.from_buffers(kind, len(values), buffers, _text_array(values.names))
 
 
-def _list_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
-    if not isinstance(kind, pa.ListType):
-        raise TypeError(f"expected a list type, found {kind}")
-    if pa.types.is_floating(kind.value_type):
-        parts = [np.ma.asarray(part, dtype=np.float64) for part in values if part is not None]
-        numbers = np.concatenate([np.empty(0), *(part.filled(np.nan) for part in parts)])
-        known = ~np.concatenate([np.empty(0, bool), *(np.ma.getmaskarray(part) for part in parts)])
-        buffers = [_validity(known), _buffer(numbers)]
-        child: pa.Array[Any] = pa.Array.from_buffers(kind.value_type, len(numbers), buffers)
-    else:
-        items = [item for part in values if part is not None for item in part]
-        child = _build_array(items, kind.value_type)
-    offsets = _offsets([0 if part is None else len(part) for part in values])
-    valid = np.array([part is not None for part in values], dtype=bool)
-    return pa.Array.from_buffers(kind, len(values), [_validity(valid), offsets], children=[child])
+def _list_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
+    if not isinstance(kind, pa.ListType) or isinstance(values, Structs | Coded):
+        raise TypeError(f"expected {kind}, found {type(values).__name__}")
+    lists = values if isinstance(values, Listed) else _listed(values, is_floats=pa.types.is_floating(kind.value_type))
+    known = np.ones(len(lists), dtype=np.bool_) if lists.known is None else lists.known
+    is_floats = pa.types.is_floating(kind.value_type)
+    child = _floats(lists.items, kind) if is_floats else _build_array(lists.items, kind.value_type)
+    buffers = [_validity(known), _buffer(lists.offsets.astype(np.int32))]
+    return pa.Array.from_buffers(kind, len(lists), buffers, children=[child])
 
 
-def _struct_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
-    if not isinstance(kind, pa.StructType):
-        raise TypeError(f"expected a struct type, found {kind}")
+def _listed(values: Values, *, is_floats: bool) -> Listed:
+    """Return a sequence of sequences or None side by side."""
+    parts = [part for part in values if part is not None]
+    items: Any = [item for part in parts for item in part] if not is_floats else _joined(parts)
+    offsets = np.concatenate([[0], np.cumsum([0 if part is None else len(part) for part in values], dtype=np.int64)])
+    return Listed(offsets, items, np.array([part is not None for part in values], dtype=np.bool_))
+
+
+def _joined(parts: Sequence[Any]) -> npt.NDArray[Any]:
+    """Return all numbers of lists, masked ones among them."""
+    numbers: npt.NDArray[Any] = np.concatenate([np.empty(0), *(np.ma.getdata(np.ma.asarray(each)) for each in parts)])
+    return np.ma.masked_array(numbers, np.concatenate([np.empty(0, bool), *map(np.ma.getmaskarray, parts)]))
+
+
+def _floats(items: Any, kind: pa.ListType[Any]) -> pa.Array[Any]:
+    """Return the numbers of lists: NaN stays, masked is null."""
+    numbers = np.ma.asarray(items, dtype=np.float64)
+    buffers = [_validity(~np.ma.getmaskarray(numbers)), _buffer(numbers.filled(np.nan))]
+    return pa.Array.from_buffers(kind.value_type, len(numbers), buffers)
+
+
+def _struct_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
+    if not isinstance(kind, pa.StructType) or isinstance(values, Listed | Coded):
+        raise TypeError(f"expected {kind}, found {type(values).__name__}")
     fields = [kind.field(i) for i in range(kind.num_fields)]
-    children = [_build_column([getattr(item, field.name) for item in values], field) for field in fields]
+    if isinstance(values, Structs):
+        children = [_build_column(values.fields[field.name], field) for field in fields]
+    else:
+        children = [_build_column([getattr(item, field.name) for item in values], field) for field in fields]
     return pa.Array.from_buffers(kind, len(values), [None], children=children)
 
 
-def _offsets(lengths: Sequence[int]) -> pa.Buffer:
+def _offsets(lengths: Values) -> pa.Buffer:
     return _buffer(np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int32))
 
 

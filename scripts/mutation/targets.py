@@ -12,6 +12,8 @@ LIMITS: Final = ("unit/test_consistency_limits.py", "unit/test_consistency.py")
 ROUNDS: Final = ("unit/test_joint_rounds.py",)
 NO_SCALE: Final = ("unit/test_keypoint_scale_noise.py::test_too_few_tracks_are_not_fitted",)
 
+_COLUMNS: Final = "unit/test_image_columns.py"
+_SAME_TABLE: Final = f"{_COLUMNS}::test_the_table_says_what_each_image_says"
 _REFERENCE: Final = "unit/test_witness_reference.py"
 
 TARGETS: Final = (
@@ -23,7 +25,7 @@ TARGETS: Final = (
     Target(
         "audit/decision/camera.py",
         DECISION,
-        ("judge_camera", "_judge_own", "material_step", "_not_optimal", "pose_alone", "_MOST"),
+        ("judge_camera", "material_steps", "step_text", "pose_alone", "_MOST"),
     ),
     Target("audit/decision/outside.py", ("unit/test_decision_outside.py",)),
     Target("audit/witnesses/pairs.py", ("unit/test_witness_pairs.py",), ("contradiction_p", "_statement")),
@@ -41,21 +43,41 @@ TARGETS: Final = (
     Target(
         "audit/decision/misfit.py",
         DECISION,
-        ("decide_misfit", "is_worth_nothing", "named_cause", "MisfitDecision.largest_px", "_SHIFTS", "_SAYS_NOTHING"),
+        (
+            *("decide_misfits", "are_worth_nothing", "named_causes", "judge_misfit", "_too_few_tested", "_not_tested"),
+            *("_worthless", "_shared", "_causes", "MisfitDecisions.largest_px", "MisfitDecisions.untested"),
+            *("MisfitDecisions._also", "MisfitDecisions.effect_text", "_SHIFTS", "_SAYS_NOTHING"),
+        ),
     ),
     Target("reports/compare/pose_limits.py", ("unit/test_pose_limits.py",), ("pose_limits", "PoseLimit.passed")),
     Target("reports/export/selection.py", ("unit/test_pose_limits.py",), ("known_to",)),
     Target("audit/decision/rejections.py", ("unit/test_rejections.py",)),
     Target("audit/decision/triage.py", ("unit/test_decision_triage.py",)),
-    Target("audit/decision/severity.py", DECISION, ("severity_of", "worth_of", "worth_severity", "_ALWAYS_HARD")),
+    Target("audit/decision/severity.py", DECISION, ("severities_of", "worth_severities", "_ALWAYS_HARD")),
     Target(
         "audit/decision/diagnostics.py",
         DECISION,
+        ("OwnDiagnostics.largest",),
+    ),
+    Target(
+        "audit/decision/judged.py",
         (
-            "MisfitDiagnostics.num_lens_groups",
-            "CameraDiagnostics.principal_point_outside",
-            "OwnDiagnostics.largest",
+            *DECISION,
+            "unit/test_decision_outside.py",
+            f"{_COLUMNS}::test_a_decision_does_not_depend_on_the_images_beside",
         ),
+        ("Said.only", "Judged.of", "Judged.of_those", "say", "_at", "said_of"),
+    ),
+    Target(
+        "audit/decision/decisions.py",
+        (*DECISION, f"{_COLUMNS}::test_a_decision_does_not_depend_on_the_images_beside"),
+        ("Decision.under", "deciders", "Decisions.under", "Decisions.rejects", "Decisions.decision"),
+    ),
+    Target("audit/decision/columns.py", (_SAME_TABLE,), ("_policy_reasons", "_offsets")),
+    Target(
+        "audit/engine/known.py",
+        (f"{_COLUMNS}::test_what_decides_is_that_of_each_image",),
+        ("_steps", "_unusable", "_parts", "_own", "_camera", "_sd_k1", "_misfit"),
     ),
     Target(
         "audit/table/words.py",
@@ -78,11 +100,11 @@ TARGETS: Final = (
         NUMBERS,
         (
             *("misfit_diagnostics", "untested_misfit", "_group", "consistency_diagnostics", "own_diagnostics"),
-            *("gains_of", "joint_camera", "_IMPLIED_COLUMNS", "implied_of"),
+            *("gains_of", "joint_camera", "_IMPLIED_COLUMNS", "implied_by_camera"),
         ),
     ),
-    Target("audit/engine/model.py", NUMBERS, ("ModelAuditor._shared_misfit",)),
-    Target("audit/engine/camera.py", NUMBERS, ("image_advice",)),
+    Target("audit/engine/model.py", NUMBERS, ("ModelAuditor.shared_misfit",)),
+    Target("audit/engine/camera.py", NUMBERS, ("is_advisable", "images_advice")),
     Target(
         "audit/consistency/image.py", LIMITS, ("ConsistencyLimits", "_judged", "_exceeds", "_is_tail", "_half_pixel")
     ),
@@ -115,16 +137,16 @@ TARGETS: Final = (
 NAMED: Final = (
     Named(
         "an image is rejected for a significant misfit that is not material",
-        "audit/decision/members.py",
-        "if found.group is not None and found.material:",
-        "if found.group is not None:",
+        "audit/decision/misfit.py",
+        "material = open_ & found.material.any(axis=1)",
+        "material = open_ & (found.cause >= 0)",
         DECISION,
     ),
     Named(
         "a camera is named as a whole beside images that are accepted",
-        "audit/decision/members.py",
-        "    return Judgement(Verdict.ACCEPTED, remarks)\n",
-        "    return Judgement(Verdict.REJECTED if misfit.shared else Verdict.ACCEPTED, remarks)\n",
+        "audit/decision/misfit.py",
+        "rejected = material & ~worthless",
+        "rejected = (material & ~worthless) | (open_ & shared)",
         DECISION,
     ),
     Named(
@@ -137,8 +159,8 @@ NAMED: Final = (
     Named(
         "the cause is taken from groups that are not material",
         "audit/decision/misfit.py",
-        "cause = named_cause(groups, material or significant)",
-        "cause = named_cause(groups, significant)",
+        "cause = named_causes(measured, candidates)",
+        "cause = named_causes(measured, significant)",
         DECISION,
     ),
     Named(

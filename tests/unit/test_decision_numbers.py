@@ -18,8 +18,9 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import Cause, Explanation, ImageConsistency
 from sfm_audit.audit.decision.camera import material_step
 from sfm_audit.audit.decision.diagnostics import Gains, SharedMisfit, Worth
+from sfm_audit.audit.decision.judged import VERDICTS
 from sfm_audit.audit.engine import jointly
-from sfm_audit.audit.engine.camera import image_advice
+from sfm_audit.audit.engine.camera import images_advice
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.joint import CameraStep, Implied, JointTest
 from sfm_audit.audit.joint import Worth as JointWorth
@@ -134,7 +135,7 @@ def test_a_joint_test_keeps_its_numbers():
     assert radial.worth == Worth(0.1, 0.2, 0.3)
     assert found.groups[MisfitGroup.SMOOTH].gain == -math.inf
     nothing = jointly.untested_misfit(30, 0.4, MisfitStatus.EXCLUDED)
-    assert (nothing.num_tested, nothing.sigma_px, nothing.num_lens_groups) == (30, 0.4, 0)
+    assert (nothing.num_tested, nothing.sigma_px) == (30, 0.4)
     assert {group.status for group in nothing.groups.values()} == {MisfitStatus.EXCLUDED}
     assert all(math.isnan(group.q) and group.gain == -math.inf for group in nothing.groups.values())
 
@@ -204,7 +205,7 @@ def test_implied_parameters_by_column():
         return SimpleNamespace(parameter=parameter, camera_idx=camera_idx, step=np.array(step), sd=0.1 * np.array(step))
 
     found = [one(Implied.PRINCIPAL_POINT, 3, 1.0, 2.0), one(Implied.ASPECT, 3, 4.0), one(Implied.RADIAL, 2, 9.0)]
-    assert jointly.implied_of(found, 3) == pytest.approx(
+    assert jointly.implied_by_camera(found)[3] == pytest.approx(
         {
             "implied_cx": 1.0,
             "implied_cx_sd": 0.1,
@@ -214,12 +215,13 @@ def test_implied_parameters_by_column():
             "implied_aspect_sd": 0.4,
         }
     )
-    assert jointly.implied_of([one(Implied.TANGENTIAL, 3, 5.0, 6.0)], 3) == pytest.approx(
+    assert jointly.implied_by_camera([one(Implied.TANGENTIAL, 3, 5.0, 6.0)])[3] == pytest.approx(
         {"implied_p1": 5.0, "implied_p1_sd": 0.5, "implied_p2": 6.0, "implied_p2_sd": 0.6}
     )
-    assert jointly.implied_of([one(Implied.RADIAL, 2, 7.0)], 2) == pytest.approx(
+    assert jointly.implied_by_camera([one(Implied.RADIAL, 2, 7.0)])[2] == pytest.approx(
         {"implied_radial": 7.0, "implied_radial_sd": 0.7}
     )
+    assert jointly.implied_by_camera([one(Implied.RADIAL, None, 7.0)]) == {}  # of all cameras together
 
 
 # a camera that several images share
@@ -234,7 +236,7 @@ def shared_of(num_images=2, material=(MisfitGroup.RADIAL,), group=MisfitGroup.RA
     auditor = SimpleNamespace(
         model=SimpleNamespace(images=SimpleNamespace(camera_id=np.array([7, 7]))), cameras=[camera]
     )
-    return ModelAuditor._shared_misfit(auditor, 0)
+    return ModelAuditor.shared_misfit(auditor, 0)
 
 
 def test_a_shared_camera_has_several_images_and_a_material_misfit():
@@ -265,13 +267,19 @@ def advice_for(material, group, rejecting=(), misfit=None):
     known = SimpleNamespace(parameters=SimpleNamespace(sd_of=lambda _: 1.0))
     seen = SimpleNamespace(shape=SimpleNamespace(camera=camera), identifiability=known)
     verdict = misfit or (Verdict.REJECTED if material else Verdict.ACCEPTED)
-    members = {Member.MISFIT: verdict, **dict.fromkeys(rejecting, Verdict.REJECTED)}
-    decision = SimpleNamespace(
-        misfit=SimpleNamespace(material=material, group=group, tau_px=0.2),
-        members={member: SimpleNamespace(verdict=said) for member, said in members.items()},
-        of=members.get,
+    decisions = SimpleNamespace(
+        misfit=SimpleNamespace(
+            material=np.array([[each in material for each in GROUPS]] * 2),
+            measured=SimpleNamespace(known=np.array([True, False])),
+            record=lambda _: SimpleNamespace(material=material, group=group),
+            tau_px=np.full(2, 0.2),
+        ),
+        rejects=np.array([bool(rejecting) or verdict is Verdict.REJECTED] * 2),
+        members={Member.MISFIT: SimpleNamespace(verdict=np.array([VERDICTS.index(verdict)] * 2))},
     )
-    return image_advice(seen, decision, None, alpha=0.05)
+    advice, of_nothing = images_advice([seen, seen], decisions, None, alpha=0.05)
+    assert of_nothing is None  # nothing was tested
+    return advice
 
 
 def test_no_smaller_model_is_advised_beside_a_rejection():

@@ -10,6 +10,8 @@ from decision_samples import sound
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.decision import outside
 from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.judged import NOT_ASKED, VERDICTS, Judgement
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.decision.outside import disagrees, judge_outside
 from sfm_audit.audit.table.witnesses import (
     MAX_FALSE_ALARMS,
@@ -34,23 +36,33 @@ def may_reject(request, monkeypatch):
     return makes
 
 
+def judged(said):
+    """What the witnesses make of an image, and of another one that nobody was asked about."""
+    both = judge_outside(Measured.of([sound(testimonies=said), sound()]), SETTINGS)
+    assert both.verdict[1] == NOT_ASKED
+    if both.verdict[0] == NOT_ASKED:
+        assert not both.said
+        return None
+    return Judgement(VERDICTS[both.verdict[0]], tuple(each.reason(0) for each in both.said))
+
+
 @pytest.mark.parametrize("said", [None, ()])
 def test_no_witness_no_verdict(said):
-    assert judge_outside(sound(testimonies=said), SETTINGS) is None
+    assert judged(said) is None
     decision = decide(sound(testimonies=said), SETTINGS)
     assert decision.of(Member.OUTSIDE) is None
     assert decision.verdict == Verdict.ACCEPTED
 
 
 def test_a_witness_that_agrees_accepts():
-    judgement = judge_outside(sound(testimonies=(AGREES,)), SETTINGS)
+    judgement = judged((AGREES,))
     assert (judgement.verdict, judgement.reasons) == (Verdict.ACCEPTED, ())
 
 
 @pytest.mark.parametrize("witness", Witness)
 def test_a_witness_that_disagrees_is_named_with_its_numbers(may_reject, witness):
     against = replace(AGAINST, witness=witness, unit="deg")
-    judgement = judge_outside(sound(testimonies=(AGREES, against)), SETTINGS)
+    judgement = judged((AGREES, against))
     assert judgement.verdict == may_reject
     (reason,) = judgement.reasons
     assert (reason.code, reason.member) == (WITNESS_CODES[witness], Member.OUTSIDE)
@@ -72,7 +84,7 @@ def test_the_strongest_word_counts(monkeypatch):
     words[codes[Witness.PAIRS]] = replace(words[codes[Witness.PAIRS]], makes=Verdict.UNDETERMINED)
     monkeypatch.setattr(outside, "REASONS", words)
     both = (AGAINST, replace(AGAINST, witness=Witness.FOLD))
-    assert judge_outside(sound(testimonies=both), SETTINGS).verdict == Verdict.REJECTED
+    assert judged(both).verdict == Verdict.REJECTED
 
 
 def test_a_witness_may_reject_after_enough_healthy_images_with_hardly_a_false_alarm():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from decision_samples import (
     MATERIAL,
@@ -21,9 +22,10 @@ from decision_samples import (
 )
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import decide
-from sfm_audit.audit.decision.members import Judgement
-from sfm_audit.audit.decision.severity import severity_of, worth_of
+from sfm_audit.audit.decision.decide import decide, decide_all
+from sfm_audit.audit.decision.judged import VERDICTS, Judged
+from sfm_audit.audit.decision.measured import Measured
+from sfm_audit.audit.decision.severity import SEVERITIES, severities_of
 from sfm_audit.audit.table.words import SEVERITY_ORDER, Member, Severity, Verdict
 
 HARD, MEDIUM, WEAK = Severity.HARD, Severity.MEDIUM, Severity.WEAK
@@ -71,10 +73,16 @@ def test_severity_does_not_depend_on_the_policy():
     assert decide(noise(ks_p=0.01), AuditConfig(policy="camera")).severity is WEAK
 
 
-def test_a_witness_outside_is_hard():
-    members = {Member.OUTSIDE: Judgement(Verdict.REJECTED), Member.KS: Judgement(Verdict.REJECTED)}
-    assert severity_of(members, None, None) is HARD
-    assert severity_of({Member.OUTSIDE: Judgement(Verdict.ACCEPTED)}, None, None) is None
+@pytest.mark.parametrize(("verdict", "severity"), [(Verdict.REJECTED, HARD), (Verdict.ACCEPTED, None)])
+def test_a_witness_outside_is_hard(verdict, severity):
+    members = {member: judged(Verdict.ACCEPTED) for member in Member}
+    members[Member.OUTSIDE] = judged(verdict)
+    (found,) = severities_of(members, np.full((1, 3), NAN))
+    assert (None if found < 0 else SEVERITIES[found]) is severity
+
+
+def judged(verdict):
+    return Judged(np.array([VERDICTS.index(verdict)]), ())
 
 
 def test_the_worth_is_that_of_the_named_cause():
@@ -82,13 +90,11 @@ def test_the_worth_is_that_of_the_named_cause():
         radial=group(q=0.01, px=0.3, gain=1.0, worth=worth(deg=9.0)),
         tangential=group(q=0.01, px=0.3, gain=2.0, worth=worth(deg=0.001, focal=0.0)),
     )
-    decision = decide(found, AuditConfig())
-    assert worth_of(decision.misfit, found.misfit).rotation_deg == 0.001
-    assert decision.severity is WEAK
-    nothing = decide(SOUND, AuditConfig())
-    assert worth_of(nothing.misfit, SOUND.misfit) is None
-    assert worth_of(None, SOUND.misfit) is None
-    assert worth_of(decision.misfit, None) is None
+    decisions = decide_all(Measured.of([found, SOUND, sound(misfit=None)]), AuditConfig())
+    assert decisions.misfit.worth[0].tolist() == [0.001, 0.01, 0.0]
+    assert np.isnan(decisions.misfit.worth[1:]).all()
+    assert decisions.decision(0).severity is WEAK
+    assert [decisions.decision(i).severity for i in (1, 2)] == [None, None]
 
 
 def test_hard_is_listed_first():

@@ -11,23 +11,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from joint_reference import with_param
+from decision_models import NUM_DEFECTIVE, SPEC, broken, defective, model_with
 
 from sfm_audit.audit import AuditConfig, audit_model
 from sfm_audit.audit.decision.from_table import FixedSettingError, MissingColumnError, redecide
 from sfm_audit.audit.engine import image
-from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model, true_claim
+from sfm_audit.audit.simulate.adjust import adjust_scene, sparse_model
 from sfm_audit.audit.simulate.defects import DefectKind, DefectSpec
 from sfm_audit.audit.simulate.demo import demo_scene
-from sfm_audit.audit.simulate.noise import NoiseSpec
-from sfm_audit.audit.simulate.scene import SceneSpec, simulate_scene
+from sfm_audit.audit.simulate.scene import simulate_scene
 from sfm_audit.audit.table import build_table, schema
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
 from sfm_audit.audit.table.words import POLICIES, REASONS, SEVERITY_ORDER, UNUSABLE, WITNESS_CODES, ReasonCode, Verdict
 
 RUN = AuditConfig()
-SPEC = SceneSpec(num_images=12, points_per_image=150, noise=NoiseSpec(sigma_px=0.5))
-NUM_DEFECTIVE = 3
 
 
 def images_of(model, settings=RUN) -> pa.Table:
@@ -42,32 +39,6 @@ def assert_same(found: pa.Table, wanted: pa.Table):
     assert found.schema == wanted.schema
     for name in wanted.column_names:
         assert repr(found.column(name).to_pylist()) == repr(wanted.column(name).to_pylist()), name  # NaN in lists
-
-
-def model_with(*defects: DefectSpec, spec=SPEC, adjusted=False):
-    scene = simulate_scene(replace(spec, defects=defects), np.random.default_rng(5))
-    return sparse_model(scene, adjust_scene(scene) if adjusted else true_claim(scene))
-
-
-def defective(kind: DefectKind):
-    values = {DefectKind.FEW_POINTS: (15.0, 1.0)}.get(kind)
-    return model_with(*(DefectSpec(i, kind, 1.5, values) for i in range(NUM_DEFECTIVE)), adjusted=True)
-
-
-def broken():
-    """Images that cannot be projected, parts that do not fit, a frozen focal length, a pose that moved."""
-    model = with_param(model_with(adjusted=True), 5, 0, 1200.0)
-    images = model.images
-    quat, translation = images.quat_cam_from_world_wxyz.copy(), images.translation_cam_from_world.copy()
-    translation[2] = np.nan
-    quat[3] = [0.5, 0.5, 0.5, 0.5]
-    translation[4] += 0.02
-    camera_idx = images.camera_idx.copy()
-    camera_idx[7] = -1
-    changed = replace(
-        images, quat_cam_from_world_wxyz=quat, translation_cam_from_world=translation, camera_idx=camera_idx
-    )
-    return with_param(with_param(replace(model, images=changed), 6, 0, np.nan), 8, 0, 1e13)
 
 
 @pytest.fixture(scope="module")
