@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.linalg import blas, lapack, qr
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from sfm_audit.audit.kernels.joint import near_entries
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
@@ -159,9 +160,19 @@ class BandedInverse:
 
     def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
         """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
-        if self._is_near(columns):
+        if not self._is_near(columns):
+            return self.times(columns, right)[columns]
+        place = self.factor.band.place[columns]
+        order = np.argsort(place, kind="stable")
+        entries = near_entries(place[order], self.factor.band.width, self.near)
+        if entries is None:
             return np.asarray(self.block(columns) @ right)
-        return self.times(columns, right)[columns]
+        scale, null, pull = self.inverse_scale[columns][:, None], self.factor.null[place], self.pull[place]
+        scaled = right * scale
+        out = np.empty_like(scaled)
+        out[order] = entries @ scaled[order]
+        out -= null @ (pull.T @ scaled) + pull @ (null.T @ scaled)
+        return np.asarray(scale * out)
 
     def _is_near(self, columns: IntArray) -> bool:
         """Whether all entries at some columns are at hand."""

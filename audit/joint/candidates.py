@@ -20,32 +20,45 @@ class CandidateScores:
     """c candidate fields, projected off the base: sums that need nobody beyond who shares their tracks.
 
     sq_length: (c,) |E|^2 before the projection.    gram: (c, c) K.    score: (c,) u.
-    track_score: (T, c) G of the T tracks that the images see; of large images (c, c) with the same G^T G.
-    num_tracks: T.
-    coupling: (s, c) R at the columns ``support`` (s,) of the base.    solution: (s, c) B = S^+ R there.
+    meat: (c, c) sum of G_t^T G_t over the T tracks that the images see.    num_tracks: T.
+    support: (s,) columns of the base that the fields meet.    basis_coupling, basis_solution: (s, f) R and B = S^+ R of
+    the basis that the fields are made of.    fields: (f, c) how; None where they are the basis.
     num_observations: of the images.
     """
 
     sq_length: FloatArray
     gram: FloatArray
     score: FloatArray
-    track_score: FloatArray
+    meat: FloatArray
     num_tracks: int
-    coupling: FloatArray
+    basis_coupling: FloatArray
     support: IntArray
-    solution: FloatArray
+    basis_solution: FloatArray
     num_observations: int
+    fields: FloatArray | None = None
+
+    @property
+    def coupling(self) -> FloatArray:
+        """(s, c) R."""
+        return self.basis_coupling if self.fields is None else self.basis_coupling @ self.fields
+
+    @property
+    def solution(self) -> FloatArray:
+        """(s, c) B = S^+ R."""
+        return self.basis_solution if self.fields is None else self.basis_solution @ self.fields
 
     def only(self, columns: slice) -> CandidateScores:
         """Return some of the fields; each was projected off the base alone, so that nothing else changes."""
+        is_basis = self.fields is None
         return replace(
             self,
             sq_length=self.sq_length[columns],
             gram=self.gram[columns, columns],
             score=self.score[columns],
-            track_score=self.track_score[:, columns],
-            coupling=self.coupling[:, columns],
-            solution=self.solution[:, columns],
+            meat=self.meat[columns, columns],
+            basis_coupling=self.basis_coupling[:, columns] if is_basis else self.basis_coupling,
+            basis_solution=self.basis_solution[:, columns] if is_basis else self.basis_solution,
+            fields=None if self.fields is None else self.fields[:, columns],
         )
 
 
@@ -103,21 +116,15 @@ def candidate_scores(
     solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
     padded = np.vstack([solution, np.zeros((1, len(gram)))])
-    track_score = np.zeros((0, len(gram)))
+    meat = np.zeros_like(gram)
     for part in parts:
         own_score = sums.track_scores(part) if in_parts else sums.track_score
         coupling.subtract_scores(own_score, around.of(part), padded, kept_scores)
-        track_score = _joined(track_score, own_score) if in_parts else own_score
+        with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
+            meat += own_score.T @ own_score
     num_observations = sum(observations.num_of(image) for image in images)
-    of_fields = sq_length, 0.5 * (gram + gram.T), sums.score, track_score, points.size
+    of_fields = sq_length, 0.5 * (gram + gram.T), sums.score, meat, points.size
     return CandidateScores(*of_fields, right[:-1], coupling.support, solution, num_observations)
-
-
-def _joined(root: FloatArray, track_score: FloatArray) -> FloatArray:
-    """(c, c) R with R^T R the sum of both G^T G; columns that are not finite are zero: their K is not finite either."""
-    rows = np.concatenate([root, track_score])
-    rows[:, ~np.isfinite(rows).all(axis=0)] = 0.0
-    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _points_of(base: Base, images: Sequence[int]) -> IntArray:

@@ -10,6 +10,8 @@ import numpy as np
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout
+from sfm_audit.audit.kernels import kernels_in_use
+from sfm_audit.audit.kernels.joint import DesignInputs, fill_design
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -96,6 +98,9 @@ def _fill(
 ) -> None:
     """Write the rows of an image's chosen observations, columns of ModelResiduals."""
     image, source = which
+    inputs = _inputs(model, residuals, layout, image, source)
+    if inputs is not None and fill_design(own, inputs):
+        return
     projected = image_inliers(model, residuals, image, source - residuals.offsets[image]).projected
     own[:, :, : POINT.start] = projected.pose[: POINT.start].transpose(2, 1, 0)
     own[:, :, POINT] = _point_columns(residuals, source)
@@ -104,6 +109,34 @@ def _fill(
         own[:, :, NUM_POSE : NUM_POSE + len(params)] = projected.d_params[params].transpose(2, 1, 0)
     else:  # at the poles of a panorama a column may not be finite: no effect there
         own[~np.isfinite(own)] = 0.0
+
+
+def _inputs(
+    model: SparseModel, residuals: ModelResiduals, layout: Layout, image_idx: int, source: IntArray
+) -> DesignInputs | None:
+    """What the compiled design is made of; None where it is not to be used: panoramas have columns that are not finite."""
+    image = model.image(image_idx)
+    camera = image.camera
+    if not kernels_in_use() or camera is None or camera.model.is_spherical:
+        return None
+    rotation = image.rotation_cam_from_world
+    focals, centre, extras = camera.model.focal_idxs, camera.model.principal_point_idxs, camera.model.extra_idxs
+    kinds = {focals[0]: 0} if len(focals) == 1 else {focals[0]: 1, focals[-1]: 2}
+    kinds |= {param: 3 + e for e, param in enumerate(extras)}
+    params = layout.own_param_idxs[int(layout.camera_idx[image_idx])]
+    lens = camera.params[[focals[0], focals[-1], centre[0], centre[-1]]]
+    facts = [rotation.ravel(), np.linalg.pinv(rotation).ravel(), image.translation_cam_from_world, lens]
+    observed = model.observations.xy_px.take(residuals.observation_row[source], axis=0)
+    return DesignInputs(
+        np.concatenate(facts),
+        np.array([kinds[param] for param in params], dtype=np.int64),
+        residuals.point_jacobian,
+        source,
+        int(residuals.offsets[image_idx]),
+        model.points.xyz_world.take(residuals.point_idx[source], axis=0),
+        observed - residuals.residuals_px.take(source, axis=1).T,
+        residuals.d_extra[image_idx],
+    )
 
 
 def _point_columns(residuals: ModelResiduals, source: IntArray) -> FloatArray:

@@ -46,13 +46,13 @@ def group_root(scores: CandidateScores, own: slice) -> FloatArray:
 
 
 def test_group(
-    scores: CandidateScores, meat: FloatArray, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float
+    scores: CandidateScores, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float
 ) -> GroupTest:
     """Test one group of an image's candidate fields.
 
     Parameters
     ----------
-    meat : (c, c) sum over tracks of G G^T, of all candidates        root : L of `group_root`
+    root : L of `group_root`
     """
     if not np.isfinite(scores.gram[own, own]).all():
         return untested(MisfitStatus.NOT_FINITE)
@@ -63,7 +63,7 @@ def test_group(
     if min(n, clusters) < MIN_OBSERVATIONS_PER_RANK * rank:
         return untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank)
     z = root @ scores.score[own]
-    spread = root @ meat[own, own] @ root.T
+    spread = root @ scores.meat[own, own] @ root.T
     statistic = _quadratic_form(z, spread)
     if math.isnan(statistic):
         return untested(MisfitStatus.SINGULAR, rank)

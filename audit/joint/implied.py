@@ -16,6 +16,7 @@ from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.own import CameraStep
+from sfm_audit.audit.joint.shift_scores import shift_scores
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
 from sfm_audit.audit.table.words import MisfitGroup
@@ -91,6 +92,11 @@ class ImpliedBeside:
         if image_idx not in self._asked:
             return candidates[:0]
         return _missing_columns(camera, projected, candidates)
+
+    def power(self, image_idx: int) -> int:
+        """Of r^2 in the next radial term; 0 for images that are not asked here."""
+        asked = self._asked.get(image_idx)
+        return 0 if asked is None else next_power(asked.camera)
 
     def take(self, image_idx: int, scores: CandidateScores) -> None:
         """Note what the columns would be."""
@@ -173,12 +179,15 @@ def _shift_fields(system: JointSystem, image: int, chosen: slice | IntArray) -> 
 
 def _next_radial(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
     """(2, n) field of the first radial term that the model lacks."""
-    power = (
-        next((k for k, term in enumerate(_RADIAL) if term not in functions_of(camera.model).terms), len(_RADIAL)) + 1
-    )
     focals = camera.model.focal_idxs
     scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
-    return np.asarray(scale * projected.u * (projected.u**2).sum(axis=0) ** power)
+    return np.asarray(scale * projected.u * (projected.u**2).sum(axis=0) ** next_power(camera))
+
+
+def next_power(camera: CameraRecord) -> int:
+    """Return the power of r^2 in the first radial term that the model lacks."""
+    terms = functions_of(camera.model).terms
+    return next((k for k, term in enumerate(_RADIAL) if term not in terms), len(_RADIAL)) + 1
 
 
 def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]:
@@ -196,6 +205,10 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
 
 def _of_images(system: JointSystem, asked: _Asked) -> list[ImpliedParameter]:
     images = asked.images[np.diff(system.observations.offsets)[asked.images] > 0]
+    if asked.camera_idx is None:
+        compiled = shift_scores(system.base, images)
+        if compiled is not None:
+            return _implied(system, asked._replace(images=images), compiled)
     columns = _missing_fields if asked.camera_idx is not None else _shift_fields
 
     def fields_of(image: int) -> FieldsInParts:
@@ -237,5 +250,5 @@ def _alone(scores: CandidateScores, own: slice) -> tuple[FloatArray, FloatArray,
         return unknown, unknown, math.nan
     inverse = np.linalg.inv(gram) * scale * scale[:, None]
     step = inverse @ scores.score[own]
-    spread = scores.track_score[:, own] @ inverse
-    return step, np.sqrt((spread**2).sum(axis=0)), float(step @ scores.score[own])
+    variance = np.einsum("ai,ab,bi->i", inverse, scores.meat[own, own], inverse)
+    return step, np.sqrt(np.maximum(variance, 0.0)), float(step @ scores.score[own])

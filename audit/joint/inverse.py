@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from sfm_audit.audit.joint.banded import Band, BandedFactor, band_of, banded_factor, banded_inverse
+from sfm_audit.audit.kernels.joint import dense_entries
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal
@@ -77,7 +78,8 @@ class DenseInverse:
 
     def block(self, columns: IntArray) -> FloatArray:
         """(k, k) entries of S^+ at some columns."""
-        return self.array[np.ix_(columns, columns)]
+        compiled = dense_entries(self.array, columns)
+        return self.array[np.ix_(columns, columns)] if compiled is None else compiled
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,7 @@ from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
+from sfm_audit.audit.joint.image_scores import image_scores, sums_of_base
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
@@ -81,6 +82,10 @@ class Beside(Protocol):
         """(c, 2, n) px per unit; ``candidates`` of `candidate_fields`."""
         ...
 
+    def power(self, image_idx: int) -> int:
+        """Of r^2 in the radial term among the fields, 0 where an image is not asked for any; see `image_scores`."""
+        ...
+
     def take(self, image_idx: int, scores: CandidateScores) -> None:
         """Hear what these fields would take up."""
         ...
@@ -136,7 +141,7 @@ class _Rounds:
         self, system: JointSystem, tested: BoolArray, *, alpha: float, tau_px: FloatArray, beside: Beside | None
     ) -> None:
         num_images = len(tested)
-        self._system, self._base = system, system.base
+        self._system, self._base, self._sums = system, system.base, sums_of_base(system.base)
         self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
@@ -169,6 +174,12 @@ class _Rounds:
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
 
     def _scores(self, image: int) -> CandidateScores | None:
+        power = 0 if self._beside is None else self._beside.power(image)
+        compiled = None if self._sums is None else image_scores(self._system, self._base, self._sums, image, power)
+        if compiled is not None:
+            if power and self._beside is not None:
+                self._beside.take(image, compiled.only(slice(NUM_FIELDS, None)))
+            return compiled.only(slice(0, NUM_FIELDS))
         fields: ImageFields | FieldsInParts
         if self._system.observations.num_of(image) <= AT_ONCE:
             fields = _fields_of(self._system, image, self._beside)
@@ -207,6 +218,7 @@ class _Rounds:
                 fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
                 candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
+        self._sums = sums_of_base(self._base)
 
     def _touched(self, new: BoolArray) -> BoolArray:
         """(I,) images that share points with any of the new ones."""
@@ -269,12 +281,10 @@ def _image_tests(
         return dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS)), {}
     observations = system.observations
     sigma_px, rms_px = float(observations.sigma_px[image]), float(observations.rms_px[image])
-    with np.errstate(over="ignore", invalid="ignore"):
-        meat = scores.track_score.T @ scores.track_score
     tests, worth = {}, {}
     for group, own in GROUP_COLUMNS.items():
         root = group_root(scores, own)
-        tests[group] = test_group(scores, meat, own, root, sigma_px=sigma_px, rms_px=rms_px)
+        tests[group] = test_group(scores, own, root, sigma_px=sigma_px, rms_px=rms_px)
         if tests[group].p < alpha:
             worth[group] = worth_of(system, image, scores, own, root)
     return tests, worth

@@ -11,6 +11,8 @@ from scipy import sparse
 from sfm_audit.audit.joint.design import AT_ONCE
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
+from sfm_audit.audit.joint.sums import joint_sums
+from sfm_audit.audit.kernels.joint import JointSums, unit_determinants
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
@@ -33,6 +35,10 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
     weights = observations.weight, observations.plain_weight
     inverses = [_point_inverse(observations, weight) for weight in weights]
     values_px = observations.residuals_px()
+    sums = joint_sums(observations, values_px, weights, (inverses[0], inverses[1]))
+    compiled = None if sums is None else _compiled_systems(observations, sums, inverses, values_px)
+    if compiled is not None:
+        return compiled
     cleaned = [off_points(observations, *pair, values_px) for pair in zip(weights, inverses, strict=True)]
     layout = observations.layout
     right, before = np.zeros((2, layout.num_columns + 1)), np.zeros((2, layout.num_columns + 1))
@@ -54,6 +60,43 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
         ReducedSystem(inverses[k], blocks[k].matrix(), right[k, :-1], before[k, :-1]) for k in range(len(weights))
     )
     return robust, plain
+
+
+def _compiled_systems(
+    observations: JointObservations, sums: JointSums, inverses: list[FloatArray], values_px: FloatArray
+) -> tuple[ReducedSystem, ReducedSystem] | None:
+    """The same by the compiled sums, which are without T: it comes to them here, all images at once."""
+    layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
+    cleaned = sums.off_points(values_px, 0)[1], sums.off_points(values_px, 1)[1]
+    found = [each for image in images.tolist() if (each := sums.normal(image, cleaned)) is not None]
+    if not found or len(found) < images.size:
+        return None
+    pairs = np.repeat(np.arange(images.size), [each.around.size for each in found])
+    around = np.concatenate([each.around for each in found])
+    own_transform = observations.transform[images]
+    own_columns = layout.columns[images]
+    systems = []
+    for k, inverse in enumerate(inverses):
+        gram = own_transform.transpose(0, 2, 1) @ np.stack([each.grams[k] for each in found]) @ own_transform
+        score = np.einsum("iab,ia->ib", own_transform, np.stack([each.rights[k] for each in found]))
+        right = np.bincount(own_columns.ravel(), score.ravel(), layout.num_columns + 1)
+        before = np.bincount(own_columns.ravel(), np.einsum("iaa->ia", gram).ravel(), layout.num_columns + 1)
+        slabs = np.concatenate([each.slabs[k] for each in found])
+        slabs = observations.transform[around].transpose(0, 2, 1) @ slabs @ own_transform[pairs]
+        first = np.flatnonzero(np.diff(pairs, prepend=-1))
+        slabs[first] += 0.5 * gram
+        matrix = _symmetric(layout.num_columns, layout.columns[around], own_columns[pairs], slabs)
+        systems.append(ReducedSystem(inverse, matrix, right[:-1], before[:-1]))
+    return systems[0], systems[1]
+
+
+def _symmetric(num_columns: int, rows: IntArray, columns: IntArray, blocks: FloatArray) -> sparse.csr_array:
+    """(D, D) A + A^T of blocks (m, r, c) of A at rows (m, r) and columns (m, c); D is padding."""
+    row = np.broadcast_to(rows.astype(np.int32)[:, :, None], blocks.shape).ravel()
+    column = np.broadcast_to(columns.astype(np.int32)[:, None, :], blocks.shape).ravel()
+    size = num_columns + 1
+    half = sparse.coo_array((blocks.ravel(), (row, column)), shape=(size, size)).tocsr()
+    return sparse.csr_array((half + half.T)[:num_columns, :num_columns])
 
 
 def _eliminate_points(
@@ -92,6 +135,11 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
     left_px : (n, 2) y~, the residuals after the step; they are off J, so g_t is the sum of w N^T y~ over the views
     """
     layout, transform = observations.layout, observations.transform
+    nothing = np.zeros((observations.num_points, 3, 3))
+    sums = joint_sums(observations, left_px, (observations.weight,), (nothing,))
+    compiled = None if sums is None else _compiled_meat(observations, sums)
+    if compiled is not None:
+        return compiled
     blocks = _Blocks(layout.num_columns)
     for image, around in _neighbourhoods(observations):
         track = around.track[: around.starts[1]]
@@ -101,6 +149,17 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
         slab[0] *= 0.5
         blocks.add(layout.columns[image], layout.columns[around.images], slab.transpose(0, 2, 1))
     return blocks.matrix()
+
+
+def _compiled_meat(observations: JointObservations, sums: JointSums) -> sparse.csr_array | None:
+    layout, transform, images = observations.layout, observations.transform, observations.used_images
+    found = [each for image in images if (each := sums.meat(image)) is not None]
+    if not found or len(found) < len(images):
+        return None
+    own = np.repeat(images, [around.size for around, _ in found]).astype(np.int64)
+    around = np.concatenate([around for around, _ in found])
+    slabs = transform[around].transpose(0, 2, 1) @ np.concatenate([slab for _, slab in found]) @ transform[own]
+    return _symmetric(layout.num_columns, layout.columns[around], layout.columns[own], slabs)
 
 
 def off_points(
@@ -140,6 +199,8 @@ def _point_inverse(observations: JointObservations, weight: FloatArray) -> Float
         observations.residuals.point_jacobian, everywhere, observations.residuals.point_idx, observations.num_points
     )
     del everywhere
+    if unit_determinants(information, smallest=0.0, invert=True) is not None:
+        return information
     seen = np.flatnonzero(np.diff(observations.point_offsets) > 0)
     for start in range(0, seen.size, AT_ONCE):  # in place: what nobody sees is zero, and stays so
         part = seen[start : start + AT_ONCE]

@@ -11,12 +11,14 @@ from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY, PART, POINT, Design, make_design
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
+from sfm_audit.audit.kernels import joint as kernels
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 MIN_INLIERS: Final = 20
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
 _SINGULAR_POINT: Final = 1e-9  # determinant of V with unit diagonal
+_SMALLEST_SQUARE: Final = 1e-300
 _MIN_VIEWS: Final = 2
 
 
@@ -214,13 +216,19 @@ def _regular_points(residuals: ModelResiduals, weight: FloatArray, num_points: i
     """(P,) points with two views or more whose V can be inverted."""
     information = point_information(residuals.point_jacobian, weight, residuals.point_idx, num_points)
     views = np.bincount(residuals.point_idx[weight > 0], minlength=num_points)
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), 1e-300))
+    determinants = kernels.unit_determinants(information, smallest=_SMALLEST_SQUARE, invert=False)
+    if determinants is not None:
+        return np.asarray((views >= _MIN_VIEWS) & (determinants > _SINGULAR_POINT))
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), _SMALLEST_SQUARE))
     unit = information / scale[:, :, None] / scale[:, None, :]
     return np.asarray((views >= _MIN_VIEWS) & (np.linalg.det(unit) > _SINGULAR_POINT))
 
 
 def point_information(jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
     """Return V (P, 3, 3) of (6): sum of w J^T J over a point's views, of J (2, 3, n)."""
+    compiled = kernels.point_information(jacobian, weight, point_idx, num_points)
+    if compiled is not None:
+        return compiled
     out = np.empty((num_points, 3, 3))
     for i in range(3):
         for j in range(i, 3):

@@ -19,6 +19,7 @@ from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
+from sfm_audit.audit.joint.sums import joint_sums, moved_by
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -208,10 +209,16 @@ def with_step(base: Base, step: FloatArray) -> Base:
     padded = np.append(step[: observations.layout.num_columns], 0.0)
     layout, weight = observations.layout, observations.weight
     left = observations.residuals_px()
-    for image in observations.used_images:
+    sums = joint_sums(observations, left, (weight,), (base.point_inverse,))
+    if sums is not None:
+        sums.subtract_step(moved_by(observations, step), left)
+    for image in observations.used_images if sums is None else ():
         observations.subtract_step(left, image, padded[layout.columns[image]])
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
+    if sums is not None:
+        moved, left = sums.off_points(left)
+        return replace(base, step=step, point_step=moved, left_px=left)
     moved = point_steps(observations, weight, base.point_inverse, left)
     left = off_points(observations, weight, base.point_inverse, left)
     return replace(base, step=step, point_step=moved, left_px=left)

@@ -13,6 +13,7 @@ import numpy as np
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
 _MONOMIALS: Final = tuple((degree - j, j) for degree in range(1, 5) for j in range(degree + 1))
@@ -41,6 +42,11 @@ GROUP_COLUMNS: Final[dict[MisfitGroup, slice]] = _slices()
 """Which columns of `candidate_fields` belong to which group."""
 
 NUM_FIELDS: Final = sum(_NUM_COLUMNS.values())
+
+
+def follows_the_lens(model: CameraModel) -> bool:
+    """Whether the candidate fields are those of the list below, without a model's own derivatives in their place."""
+    return not model.is_spherical and model.name not in _OWN_COEFFICIENTS
 
 
 def candidate_fields(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:

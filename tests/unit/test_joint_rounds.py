@@ -50,6 +50,7 @@ class Rounds:
             ),
         )
         fields = SimpleNamespace(fields=np.zeros((1, 2, 42)), nuisance=None)
+        monkeypatch.setattr(joint_room, "sums_of_base", lambda _: None)
         monkeypatch.setattr(joint_room, "_fields_of", lambda *_, **__: fields)
         monkeypatch.setattr(joint_room, "candidate_scores", lambda *_: "scores")
         monkeypatch.setattr(joint_room, "group_root", lambda _, own: np.eye(own.stop - own.start) * own.start)
@@ -221,27 +222,27 @@ def scores(num_tracks=60, num=80, gram=None, seed=1):
         sq_length=np.full(2, float(num)),
         gram=gram,
         score=track_score.sum(axis=0) + 12.0,
-        track_score=track_score,
+        meat=track_score.T @ track_score,
         num_tracks=num_tracks,
-        coupling=np.zeros((0, 2)),
+        basis_coupling=np.zeros((0, 2)),
         support=np.zeros(0, int),
-        solution=np.zeros((0, 2)),
+        basis_solution=np.zeros((0, 2)),
         num_observations=num,
     )
 
 
 def hotelling(found, *, rms_px=9.0, meat=None, root=None):
     own = slice(0, 2)
-    meat = found.track_score.T @ found.track_score if meat is None else meat
+    found = found if meat is None else replace(found, meat=meat)
     return group_test.test_group(
-        found, meat, own, group_root(found, own) if root is None else root, sigma_px=0.5, rms_px=rms_px
+        found, own, group_root(found, own) if root is None else root, sigma_px=0.5, rms_px=rms_px
     )
 
 
 def test_a_group_has_hotelling_s_p_and_the_length_of_what_it_explains():
     given = scores()
     result = hotelling(given)
-    z, spread = given.score / math.sqrt(80), given.track_score.T @ given.track_score / 80
+    z, spread = given.score / math.sqrt(80), given.meat / 80
     t = z @ np.linalg.solve(spread, z)
     f = t / (60 - t) * (60 - 2) / 2
     assert result.p == pytest.approx(stats.f.sf(f, 2, 58), rel=1e-9)
@@ -252,7 +253,7 @@ def test_a_group_has_hotelling_s_p_and_the_length_of_what_it_explains():
 
 def test_more_tracks_than_observations_count_as_many_as_there_are_observations():
     given = scores(num_tracks=60, num=50)
-    z, spread = given.score / math.sqrt(50), given.track_score.T @ given.track_score / 50
+    z, spread = given.score / math.sqrt(50), given.meat / 50
     t = z @ np.linalg.solve(spread, z)
     assert hotelling(given).p == pytest.approx(stats.f.sf(t / (50 - t) * 48 / 2, 2, 48), rel=1e-9)
 
@@ -307,14 +308,12 @@ def test_a_group_is_tested_by_itself_whatever_the_others_hold():
         sq_length=np.array([NAN, 80.0, 80.0]),
         gram=np.block([[np.full((1, 1), NAN), np.full((1, 2), NAN)], [np.full((2, 1), NAN), alone.gram]]),
         score=np.array([NAN, *alone.score]),
-        track_score=np.column_stack([np.full(60, NAN), alone.track_score]),
+        meat=np.block([[np.full((1, 1), NAN), np.full((1, 2), NAN)], [np.full((2, 1), NAN), alone.meat]]),
     )
     own = slice(1, 3)
     root = group_root(wide, own)
     np.testing.assert_array_equal(root, group_root(alone, slice(0, 2)))
-    meat = np.full((3, 3), NAN)
-    meat[1:, 1:] = alone.track_score.T @ alone.track_score
-    assert group_test.test_group(wide, meat, own, root, sigma_px=0.5, rms_px=9.0) == hotelling(alone)
+    assert group_test.test_group(wide, own, root, sigma_px=0.5, rms_px=9.0) == hotelling(alone)
 
 
 @pytest.mark.parametrize(("kept", "rank"), [(1.001e-4, 2), (0.999e-4, 1)])

@@ -135,11 +135,9 @@ def test_candidates_in_parts_are_those_of_all_points_at_once(system, images, mon
 
     parts = candidate_scores(system.base, images, lambda image: FieldsInParts(partial(part, image)))
     assert len(asked) > 3 * len(images)
-    assert parts.num_tracks == whole.num_tracks == len(whole.track_score)
+    assert parts.num_tracks == whole.num_tracks
     for name in ("sq_length", "gram", "score", "meat", "coupling"):
-        found, expected = (
-            each.track_score.T @ each.track_score if name == "meat" else getattr(each, name) for each in (parts, whole)
-        )
+        found, expected = getattr(parts, name), getattr(whole, name)
         assert_allclose(found, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max(), err_msg=name)
 
 
@@ -155,6 +153,10 @@ def test_a_large_image_is_tested_in_parts(system, monkeypatch):
         assert_allclose([t.px for t in found.values()], [t.px for t in expected.values()], rtol=1e-6, atol=1e-6)
 
 
+def meat_of(by_track):
+    return by_track.T @ by_track
+
+
 def test_candidates_are_the_fields_projected_off_everything(system, reference):
     own = fields_of(system, 2)
     scores = candidate_scores(system.base, [2], lambda _: own)
@@ -168,25 +170,24 @@ def test_candidates_are_the_fields_projected_off_everything(system, reference):
     by_track = np.zeros((system.observations.num_points, len(unit)))
     np.add.at(by_track, np.repeat(reference.point, 2), projected * left[:, None])
     seen = np.unique(system.observations.point_idx[system.observations.rows(2)])
-    assert_allclose(scores.track_score / unit, by_track[seen] / unit, atol=1e-7)
+    assert_allclose(scores.meat / unit / unit[:, None], meat_of(by_track[seen] / unit), atol=1e-7)
 
 
 def test_the_test_is_hotelling_s(system):
     own = fields_of(system, 0)
     scores = candidate_scores(system.base, [0], lambda _: own)
-    meat = scores.track_score.T @ scores.track_score
     columns = GROUP_COLUMNS[MisfitGroup.ROLLING_SHUTTER]
     root = group_root(scores, columns)
-    found = judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=100.0)
-    z, g = root @ scores.score[columns], scores.track_score[:, columns] @ root.T
-    statistic, r, c = z @ np.linalg.solve(g.T @ g, z), len(root), len(g)
+    found = judge_group(scores, columns, root, sigma_px=0.7, rms_px=100.0)
+    z, meat = root @ scores.score[columns], root @ scores.meat[columns, columns] @ root.T
+    statistic, r, c = z @ np.linalg.solve(meat, z), len(root), scores.num_tracks
     expected = stats.f.sf(statistic / r * (c - r) / c / (1 - statistic / c), r, c - r)
     assert found.p == pytest.approx(expected, rel=1e-6)
     n = system.observations.num_of(0)
-    assert found.px == pytest.approx(0.7 * np.sqrt(max(0.0, z @ z - np.sum(g**2)) / n), rel=1e-9)
+    assert found.px == pytest.approx(0.7 * np.sqrt(max(0.0, z @ z - np.trace(meat)) / n), rel=1e-9)
     scores = dataclasses.replace(scores, score=3.0 * scores.score)
-    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1.0).status is MisfitStatus.TESTED
-    assert judge_group(scores, meat, columns, root, sigma_px=0.7, rms_px=1e-3).status is MisfitStatus.NOT_ESTIMABLE
+    assert judge_group(scores, columns, root, sigma_px=0.7, rms_px=1.0).status is MisfitStatus.TESTED
+    assert judge_group(scores, columns, root, sigma_px=0.7, rms_px=1e-3).status is MisfitStatus.NOT_ESTIMABLE
 
 
 def test_inclusion_is_the_same_as_columns_more(system, reference):
@@ -214,7 +215,7 @@ def test_inclusion_is_the_same_as_columns_more(system, reference):
         by_track = np.zeros((system.observations.num_points, len(unit)))
         np.add.at(by_track, np.repeat(reference.point, 2), projected * left[:, None])
         seen = np.unique(system.observations.point_idx[system.observations.rows(image)])
-        assert_allclose(scores.track_score / unit, by_track[seen] / unit, atol=1e-6)
+        assert_allclose(scores.meat / unit / unit[:, None], meat_of(by_track[seen] / unit), atol=1e-6)
 
 
 def test_worth_is_how_far_inclusion_moves_the_image(system, model):

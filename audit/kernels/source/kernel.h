@@ -23,6 +23,13 @@
 #define WIDE
 #endif
 
+/* Ask for memory that is needed some steps later; at worst in vain. */
+#if defined(__GNUC__)
+#define SOON(address) __builtin_prefetch(address)
+#else
+#define SOON(address) ((void)(address))
+#endif
+
 /* What a kernel returns for an image; everything but DONE sends it to the numpy path. */
 enum { DONE = 0, NEEDS_NUMPY = 1, NO_MEMORY = 2 };
 

@@ -1,0 +1,194 @@
+"""`candidate_scores` of one image through the compiled sums.
+
+All candidate fields of an image are made of fewer functions than there are fields: scalars along x and the same along y
+(the principal point, the affine and the smooth fields), and some with both components. The sums are those of these 44; the
+fields' follow by a small matrix.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from sfm_audit.audit.cameras.projection import is_fisheye
+from sfm_audit.audit.joint.candidates import CandidateScores
+from sfm_audit.audit.joint.sums import joint_sums
+from sfm_audit.audit.joint.system import Base, JointSystem
+from sfm_audit.audit.kernels.joint import DENSE, FIELDS, SCALAR, FirstHalf, JointSums
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
+from sfm_audit.audit.table.words import MisfitGroup
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+from sfm_audit.loaders.model import CameraRecord
+
+_X, _Y, _BOTH = 0, SCALAR, 2 * SCALAR  # where functions along x, along y and with both components begin
+_ROLLING, _NEXT = _BOTH + 4, _BOTH + 10
+_MISSING: Final = 6
+"""Columns of the parameters that a camera may lack, behind the candidate fields: see `implied`."""
+
+
+def sums_of_base(base: Base) -> JointSums | None:
+    """Return the compiled sums over a base; None where numpy is to be used."""
+    included = {image: extra.fields for image, extra in base.included.items()}
+    weights, inverses = (base.observations.weight,), (base.point_inverse,)
+    return joint_sums(base.observations, base.left_px, weights, inverses, included)
+
+
+def image_scores(system: JointSystem, base: Base, sums: JointSums, image_idx: int, power: int) -> CandidateScores | None:
+    """Return the scores of an image's candidate fields; None where the numpy path has to be taken.
+
+    Parameters
+    ----------
+    sums : of the same base        power : of r^2 in the radial term of the missing parameters, 0 without these
+    """
+    observations = base.observations
+    image = system.model.image(image_idx)
+    camera = image.camera
+    if camera is None or not follows_the_lens(camera.model) or not sums.can(image_idx):
+        return None
+    fields = sums.fields(
+        image_idx, *_inputs(system, image_idx, camera), is_fisheye=is_fisheye(camera.model), power=power
+    )
+    if fields is None:
+        return None
+    tracks = sums.tracks(image_idx)
+    half = sums.first(image_idx, *fields, tracks)
+    if half is None:
+        return None
+    placed = _Placed(base, half.around)
+    right = placed.collected(half.right)
+    solution = base.inverse.within(placed.support, right)
+    sums.second(half, tracks, placed.spread(solution))
+    made_of = _fields(camera, np.linalg.pinv(image.rotation_cam_from_world), power)
+    gram = half.gram - right.T @ solution
+    with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
+        meat = half.track_score.T @ half.track_score
+        gram, meat = (made_of.T @ each @ made_of for each in (0.5 * (gram + gram.T), meat))
+        sq_length = ((_squares(half) @ made_of) * made_of).sum(axis=0)
+    score = half.score @ made_of
+    of_fields = sq_length, gram, score, meat, tracks[1]
+    return CandidateScores(*of_fields, right, placed.support, solution, observations.num_of(image_idx), made_of)
+
+
+def _inputs(system: JointSystem, image_idx: int, camera: CameraRecord) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Facts (18,) of `JointSums.fields`, xyz_world (n, 3), predicted xy_px (n, 2)."""
+    observations, residuals = system.observations, system.residuals
+    source = observations.source[observations.rows(image_idx)]
+    image = system.model.image(image_idx)
+    focals = camera.params[list(camera.model.focal_idxs)]
+    width, height = camera.width, camera.height
+    size = [focals[0], focals[-1], 0.5 * width, 0.5 * height, 0.5 * max(width, height), height]
+    facts = np.concatenate([image.rotation_cam_from_world.ravel(), image.translation_cam_from_world, size])
+    xyz_world = system.model.points.xyz_world.take(residuals.point_idx[source], axis=0)
+    observed = system.model.observations.xy_px.take(residuals.observation_row[source], axis=0)
+    return facts, xyz_world, observed - residuals.residuals_px.take(source, axis=1).T
+
+
+def _fields(camera: CameraRecord, world_from_cam: FloatArray, power: int) -> FloatArray:
+    """(44, c) of which functions the candidate fields are made, then the missing parameters'.
+
+    ``world_from_cam`` (3, 3): the sums have the derivatives in a translation along the world's axes.
+    """
+    out = np.zeros((FIELDS, NUM_FIELDS + (_MISSING if power else 0)))
+    focals, centre = camera.model.focal_idxs, camera.model.principal_point_idxs
+    fx, fy = camera.params[focals[0]], camera.params[focals[-1]]
+    cx, cy = camera.params[centre[0]], camera.params[centre[-1]]
+    half = 0.5 * max(camera.width, camera.height)
+    radial, tangential, affine, shift, rolling, smooth = (
+        GROUP_COLUMNS[group].start
+        for group in (
+            *(MisfitGroup.RADIAL, MisfitGroup.TANGENTIAL, MisfitGroup.AFFINE, MisfitGroup.PRINCIPAL_POINT),
+            *(MisfitGroup.ROLLING_SHUTTER, MisfitGroup.SMOOTH),
+        )
+    )
+    for k in range(2):
+        out[_BOTH + k, radial + k] = 1.0
+        out[_BOTH + 2 + k, tangential + k] = 1.0
+    out[[_X, _X + 1], affine] = 0.5 * camera.width - cx, half  # fx v_x = x - cx
+    out[[_X, _X + 2], affine + 1] = fx / fy * (0.5 * camera.height - cy), fx / fy * half
+    out[_X, shift], out[_Y, shift + 1] = fx, fy
+    out[_ROLLING : _ROLLING + 3, rolling : rolling + 3] = np.eye(3)
+    out[_ROLLING + 3 : _ROLLING + 6, rolling + 3 : rolling + 6] = world_from_cam
+    for k in range(SCALAR - 2):
+        out[_X + 1 + k, smooth + k] = 1.0
+        out[_Y + 1 + k, smooth + SCALAR - 2 + k] = 1.0
+    if power:
+        last = NUM_FIELDS
+        out[_X, last], out[_Y, last + 1], out[_NEXT, last + 2] = 1.0, 1.0, 1.0
+        out[:, last + 3] = out[:, affine]
+        out[:, last + 4 : last + 6] = out[:, tangential : tangential + 2]
+    return out
+
+
+def _squares(half: FirstHalf) -> FloatArray:
+    """(44, 44) w E^T E, as far as the lengths of fields need it: no field mixes dense functions with scalar ones."""
+    out = np.zeros((FIELDS, FIELDS))
+    out[:SCALAR, :SCALAR] = out[SCALAR:_BOTH, SCALAR:_BOTH] = half.plain
+    out[_BOTH:, _BOTH:] = half.dense_plain
+    return out
+
+
+class _Placed:
+    """Where the images around have their columns in the base.
+
+    support: (s,) columns of the base, ascending, those of included fields last.
+    """
+
+    def __init__(self, base: Base, around: IntArray) -> None:
+        layout = base.observations.layout
+        self._around, self._transform = around, base.observations.transform[around]
+        self._extra = [base.included[image].columns for image in around.tolist() if image in base.included]
+        self._is_extra = np.array([image in base.included for image in around.tolist()], dtype=bool)
+        columns = layout.columns[around]
+        self._real = (columns < layout.num_columns).ravel()
+        own = columns.ravel()[self._real]
+        distinct_own = distinct(own)
+        self._is_unique = distinct_own.size == own.size
+        self._place = np.searchsorted(distinct_own, own)
+        self._num_own, self._width = distinct_own.size, layout.width
+        order = sorted(range(len(self._extra)), key=lambda k: int(self._extra[k][0]))
+        self.support = np.concatenate([distinct_own, *(self._extra[k] for k in order)])
+        starts = np.cumsum([distinct_own.size, *(self._extra[k].size for k in order)]).tolist()
+        self._extra_place = {k: slice(starts[n], starts[n + 1]) for n, k in enumerate(order)}
+
+    def _rows(self) -> tuple[IntArray, list[slice]]:
+        """First rows of the design's columns of each image around (m,), and the rows of its included fields."""
+        sizes = np.full(len(self._around), self._width)
+        sizes[self._is_extra] += np.array([columns.size for columns in self._extra], dtype=np.int64)
+        starts = np.cumsum(sizes) - sizes
+        behind = starts[self._is_extra] + self._width
+        return starts, [
+            slice(start, start + columns.size)
+            for start, columns in zip(behind.tolist(), self._extra, strict=True)
+        ]
+
+    def collected(self, right: FloatArray) -> FloatArray:
+        """(s, F) R of (rows, F) as `JointSums.first` has it."""
+        count = right.shape[1]
+        starts, behind = self._rows()
+        own = right if not self._extra else right[(starts[:, None] + np.arange(self._width)).ravel()]
+        turned = self._transform.transpose(0, 2, 1) @ own.reshape(-1, self._width, count)
+        rows = turned.reshape(-1, count)[self._real]
+        out = np.zeros((self.support.size, count))
+        if self._is_unique:
+            out[self._place] = rows
+        else:
+            np.add.at(out, self._place, rows)
+        for k, rows_of in enumerate(behind):
+            out[self._extra_place[k]] = right[rows_of]
+        return out
+
+    def spread(self, solution: FloatArray) -> FloatArray:
+        """(rows, F) T B of each image around, in the order of `JointSums.first`, of B (s, F)."""
+        count = solution.shape[1]
+        own = np.zeros((self._real.size, count))
+        own[self._real] = solution[self._place]
+        moved = (self._transform @ own.reshape(-1, self._width, count)).reshape(-1, count)
+        if not self._extra:
+            return moved
+        starts, behind = self._rows()
+        out = np.empty((len(moved) + sum(columns.size for columns in self._extra), count))
+        out[(starts[:, None] + np.arange(self._width)).ravel()] = moved
+        for k, rows_of in enumerate(behind):
+            out[rows_of] = solution[self._extra_place[k]]
+        return out

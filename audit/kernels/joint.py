@@ -1,0 +1,458 @@
+"""The sums of the joint system, image by image: `joint.c` (what is computed: docs/method.md sections 11 and 11b)."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel, library
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+
+SmallIntArray: TypeAlias = NDArray[np.int32]
+
+SCALAR: Final = 16
+"""Scalar functions of a field along one axis: 1, the fourteen monomials, padding."""
+DENSE: Final = 12
+"""Fields with both components: radial 2, tangential 2, rolling shutter 6, the next radial term, padding."""
+FIELDS: Final = 2 * SCALAR + DENSE
+DONE: Final = 0
+_MOST_VIEWS: Final = 200_000  # of the points of one image; beyond, numpy goes through them in parts
+
+
+_ARRAYS: Final = (
+    *("offsets", "point_offsets", "image_idx", "point_idx", "by_point", "image_of"),
+    *("design", "weight", "other_weight", "left", "point_inverse", "other_inverse"),
+    *("extra_first", "extra_width", "extra"),
+)
+
+
+class _Model(ctypes.Structure):
+    """`joint_model` of joint.c."""
+
+    _fields_ = (
+        ("num_images", ctypes.c_int64),
+        ("width", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in _ARRAYS),
+    )
+
+
+_ModelPointer: Final = ctypes.POINTER(_Model)
+
+
+class FirstHalf(NamedTuple):
+    """What `JointSums.first` says of an image; F = 44 fields.
+
+    around: (m,) images that see its points, ascending.    right: (rows, F) by image around: columns of the design, then
+    its included fields.    gram: (F, F).    plain: (16, 16) and dense_plain: (12, 12): w E^T E of scalars and of dense fields.
+    score: (F,).    track_score: (T, F).    views: what `JointSums.second` needs.
+    """
+
+    around: IntArray
+    right: FloatArray
+    gram: FloatArray
+    plain: FloatArray
+    dense_plain: FloatArray
+    score: FloatArray
+    track_score: FloatArray
+    views: tuple[SmallIntArray, IntArray, FloatArray]
+
+
+class NormalOfImage(NamedTuple):
+    """What an image adds to the normal equations.
+
+    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows) and
+    the image (columns), its own one halved.    grams: (2, C, C).    rights: (2, C). All without T.
+    """
+
+    around: IntArray
+    slabs: FloatArray
+    grams: FloatArray
+    rights: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointArrays:
+    """A joint system as the kernels see it; see `sfm_audit.audit.joint.observations.JointObservations`.
+
+    design: (n, 2, C).    left_px: (n, 2).    weights, inverses: one or two systems, (n,) and (P, 3, 3).
+    extra: by image, its included fields (n_i, 2, r).
+    """
+
+    offsets: IntArray
+    image_idx: IntArray
+    point_idx: IntArray
+    by_point: IntArray
+    point_offsets: IntArray
+    design: FloatArray
+    left_px: FloatArray
+    weights: tuple[FloatArray, ...]
+    inverses: tuple[FloatArray, ...]
+    extra: dict[int, FloatArray]
+
+
+class JointSums:
+    """Sums over the views of a joint system; not for several threads at once (one object for each)."""
+
+    def __init__(self, arrays: JointArrays) -> None:
+        num_images, num_rows = len(arrays.offsets) - 1, len(arrays.image_idx)
+        num_points = len(arrays.point_offsets) - 1
+        first = np.full(num_images, -1, dtype=np.int64)
+        width = np.zeros(num_images, dtype=np.int64)
+        parts: list[FloatArray] = []
+        for image, fields in sorted(arrays.extra.items()):
+            first[image], width[image] = sum(part.size for part in parts), fields.shape[2]
+            parts.append(np.ascontiguousarray(fields))
+        extra = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(1)
+        last = len(arrays.weights) - 1
+        held: dict[str, Any] = {
+            "offsets": _ints(arrays.offsets, num_images + 1),
+            "image_idx": _small_ints(arrays.image_idx, num_rows),
+            "point_idx": _small_ints(arrays.point_idx, num_rows),
+            "by_point": _small_ints(arrays.by_point, num_rows),
+            "point_offsets": _ints(arrays.point_offsets, num_points + 1),
+            "design": _doubles(arrays.design, (num_rows, 2, arrays.design.shape[2])),
+            "weight": _doubles(arrays.weights[0], (num_rows,)),
+            "other_weight": _doubles(arrays.weights[last], (num_rows,)),
+            "left": _doubles(arrays.left_px, (num_rows, 2)),
+            "point_inverse": _doubles(arrays.inverses[0], (num_points, 3, 3)),
+            "other_inverse": _doubles(arrays.inverses[last], (num_points, 3, 3)),
+            "extra_first": first,
+            "extra_width": width,
+            "extra": extra,
+        }
+        _check_indices(held, num_images, num_points)
+        held["image_of"] = held["image_idx"].take(held["by_point"])
+        self._held = held
+        self._widths = arrays.design.shape[2] + width
+        self.width = int(arrays.design.shape[2])
+        self._model = _Model(num_images, self.width, *(held[name].ctypes.data for name in _ARRAYS))
+        self._place = np.zeros(num_images, dtype=np.int64)
+        views = np.diff(held["point_offsets"])[held["point_idx"]]
+        self._is_first = _first_views(held)
+        self._num_views = np.diff(np.concatenate([[0], np.cumsum(views)])[held["offsets"]])
+
+    def can(self, image_idx: int) -> bool:
+        """Whether the views of an image's points are few enough to be held at once."""
+        return bool(self._num_views[image_idx] <= _MOST_VIEWS)
+
+    def tracks(self, image_idx: int) -> tuple[SmallIntArray, int]:
+        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too, and their number."""
+        rows = slice(*self._held["offsets"][image_idx : image_idx + 2].tolist())
+        is_first = self._is_first[rows]
+        if is_first.all():
+            return np.arange(is_first.size, dtype=np.int32), is_first.size
+        point = self._held["point_idx"][rows]
+        number = np.cumsum(is_first) - 1
+        firsts = np.flatnonzero(is_first)
+        order = firsts[np.argsort(point[firsts], kind="stable")]
+        track = number[order[np.searchsorted(point[order], point)]]
+        return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
+
+    def fields(
+        self, image_idx: int, facts: FloatArray, xyz_world: FloatArray, xy_px: FloatArray, *, is_fisheye: bool, power: int
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return the fields (n_i, 16) and (n_i, 2, 12) of an image; None where one of its points does not project.
+
+        Parameters
+        ----------
+        facts : (18,) R, t of cam_from_world, fx, fy, half width, half height, half of the larger one, height
+        xyz_world, xy_px : (n_i, 3) and (n_i, 2) predicted        power : of r^2 in the next radial term, 0 for none
+        """
+        function = kernel("joint_fields", _ModelPointer, Size, Doubles, Doubles, Doubles, Size, Size, Doubles, Doubles)
+        n = self._num_rows(image_idx)
+        if function is None or xyz_world.shape != (n, 3) or xy_px.shape != (n, 2) or facts.shape != (18,):
+            return None
+        scalar, dense = np.empty((n, SCALAR)), np.empty((n, 2, DENSE))
+        status = function(
+            ctypes.byref(self._model), image_idx, facts, xyz_world, xy_px, int(is_fisheye), power, scalar, dense
+        )
+        return (scalar, dense) if status == DONE else None
+
+    def first(
+        self, image_idx: int, scalar: FloatArray, dense: FloatArray, tracks: tuple[SmallIntArray, int]
+    ) -> FirstHalf | None:
+        """First half of `candidate_scores`: what an image's fields are to the base, before S^+."""
+        function = kernel(
+            "joint_first",
+            *(_ModelPointer, Ints, Size, Doubles, Doubles, SmallInts, Size, Size, SmallInts, SmallInts, Ints, Ints, Ints),
+            *([Doubles] * 8),
+            Size,
+        )
+        n, views = self._num_rows(image_idx), int(self._num_views[image_idx])
+        track, num_tracks = tracks
+        if function is None or scalar.shape != (n, SCALAR) or dense.shape != (n, 2, DENSE) or track.shape != (n,):
+            return None
+        most = min(views, len(self._place))
+        view, own = np.empty((2, views), dtype=np.int32)
+        around, start, num = (np.empty(size, dtype=np.int64) for size in (most, most + 1, 2))
+        max_rows, max_scores = most * self.width, views * self.width
+        if self._held["extra"].size > 1:
+            max_rows, max_scores = int(np.sort(self._widths)[-most:].sum()), views * int(self._widths.max())
+        right = np.empty((max_rows, FIELDS))
+        gram, plain, dense_plain = (np.empty((size, size)) for size in (FIELDS, SCALAR, DENSE))
+        score, track_score, absorbing = np.empty(FIELDS), np.empty((num_tracks, FIELDS)), np.empty((n, 3, 2))
+        scores = np.empty(max_scores)
+        status = function(
+            ctypes.byref(self._model),
+            *(self._place, image_idx, scalar, dense, track, num_tracks, max_rows, view, own, around, start, num),
+            *(absorbing, right, gram, plain, dense_plain, score, track_score, scores, max_scores),
+        )
+        if status != DONE:
+            return None
+        count, rows = num.tolist()
+        around, start = around[:count], start[: count + 1]
+        return FirstHalf(
+            around, right[:rows], gram, plain, dense_plain, score, track_score, (own, start, scores)
+        )
+
+    def second(self, first: FirstHalf, tracks: tuple[SmallIntArray, int], moved: FloatArray) -> None:
+        """Second half: subtract from ``first.track_score`` what the base does, ``moved`` (rows, F) = T B, in place."""
+        function = kernel(
+            "joint_second", _ModelPointer, Size, SmallInts, Ints, Ints, SmallInts, Doubles, Doubles, Doubles
+        )
+        if function is None or moved.shape != first.right.shape:
+            raise ValueError("the second half of other kernels or other fields")
+        own, start, scores = first.views
+        arguments = (own, first.around, start, tracks[0], scores, np.ascontiguousarray(moved), first.track_score)
+        function(ctypes.byref(self._model), len(first.around), *arguments)
+
+    def normal(self, image_idx: int, cleaned: tuple[FloatArray, FloatArray]) -> NormalOfImage | None:
+        """What an image adds to the normal equations; ``cleaned`` (n, 2): residuals off the points, of both systems."""
+        function = kernel(
+            "joint_normal",
+            *(_ModelPointer, Ints, Size, Size, Doubles, Doubles, Ints, Ints, Doubles, Doubles, Doubles, Doubles),
+        )
+        views = int(self._num_views[image_idx])
+        if function is None or any(values.shape != self._held["left"].shape for values in cleaned):
+            return None
+        most = min(views, len(self._place))
+        around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
+        slab, other = np.empty((2, most, self.width, self.width))
+        grams, rights = np.empty((2, self.width, self.width)), np.empty((2, self.width))
+        status = function(
+            ctypes.byref(self._model), self._place, image_idx, views, *cleaned, around, num, slab, other, grams, rights
+        )
+        if status != DONE:
+            return None
+        count = int(num[0])
+        return NormalOfImage(around[:count], np.stack([slab[:count], other[:count]]), grams, rights)
+
+    def meat(self, image_idx: int) -> tuple[IntArray, FloatArray] | None:
+        """(m,) the image and those behind it that see its points, and (m, C, C) sums of scores times its own, without T."""
+        function = kernel(
+            "joint_meat", _ModelPointer, Ints, Size, Size, SmallInts, Size, Ints, Ints, Doubles
+        )
+        if function is None:
+            return None
+        views = int(self._num_views[image_idx])
+        most = min(views, len(self._place))
+        around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
+        slab = np.empty((most, self.width, self.width))
+        track, num_tracks = self.tracks(image_idx)
+        status = function(
+            ctypes.byref(self._model), self._place, image_idx, views, track, num_tracks, around, num, slab
+        )
+        return (around[: int(num[0])], slab[: int(num[0])]) if status == DONE else None
+
+    def off_points(self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return (P, 3) V^-1 J^T w values, and (n, 2) the values minus what that removes, of one of the systems."""
+        function = kernel(
+            "joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size
+        )
+        if function is None or values_px.shape != self._held["left"].shape:
+            raise ValueError("values of other observations, or no kernels")
+        weight, inverse = (
+            (self._held["other_weight"], self._held["other_inverse"])
+            if which
+            else (self._held["weight"], self._held["point_inverse"])
+        )
+        steps, out = np.empty((len(inverse), 3)), np.empty(values_px.shape if cleaned else (0, 2))
+        arguments = (weight, inverse, len(inverse), np.ascontiguousarray(values_px), steps, out, int(cleaned))
+        function(ctypes.byref(self._model), *arguments)
+        return steps, out
+
+    def subtract_step(self, moved: FloatArray, left_px: FloatArray) -> None:
+        """Subtract design times ``moved`` (I, C), T step of each image, from ``left_px`` (n, 2), in place."""
+        function = kernel("joint_subtract_step", _ModelPointer, Doubles, Doubles)
+        if function is None or left_px.shape != self._held["left"].shape or moved.shape != (len(self._place), self.width):
+            raise ValueError("steps of other images, or no kernels")
+        function(ctypes.byref(self._model), moved, left_px)
+
+    def along_design(self, values_px: FloatArray) -> FloatArray:
+        """(I, C) w design^T values (n, 2), summed over each image's rows."""
+        function = kernel("joint_along_design", _ModelPointer, Doubles, Doubles)
+        if function is None or values_px.shape != self._held["left"].shape:
+            raise ValueError("values of other observations, or no kernels")
+        out = np.empty((len(self._place), self.width))
+        function(ctypes.byref(self._model), np.ascontiguousarray(values_px), out)
+        return out
+
+    def _num_rows(self, image_idx: int) -> int:
+        first, last = self._held["offsets"][image_idx : image_idx + 2].tolist()
+        return int(last - first)
+
+
+class DesignInputs(NamedTuple):
+    """What the design of an image is made of.
+
+    facts: (25,) R, its inverse, t, fx, fy, cx, cy.    own: (k,) of each own parameter, 0 focal length of both axes, 1 of x,
+    2 of y, 3 + e distortion parameter e.    jacobian: (2, 3, N) in the points of all inliers of the model.
+    source: (n,) columns of it.    first: column of the image's first inlier.
+    xyz_world: (n, 3).    xy_px: (n, 2) predicted.    d_extra: (e, 2, m) of the image's m inliers.
+    """
+
+    facts: FloatArray
+    own: IntArray
+    jacobian: FloatArray
+    source: IntArray
+    first: int
+    xyz_world: FloatArray
+    xy_px: FloatArray
+    d_extra: FloatArray
+
+
+def fill_design(out: FloatArray, given: DesignInputs) -> bool:
+    """Write the design (n, 2, C) of an image; False for the numpy path."""
+    function = kernel(
+        "joint_design",
+        *([Size] * 5),
+        *(Doubles, Ints, Doubles, Ints, Size, Doubles, Doubles, Doubles, Doubles),
+    )
+    n, width, num_all = len(out), out.shape[2], given.d_extra.shape[2]
+    local = given.source - given.first
+    is_sound = (
+        given.jacobian.flags.c_contiguous
+        and given.xyz_world.shape == (n, 3)
+        and given.xy_px.shape == (n, 2)
+        and given.source.shape == (n,)
+        and given.facts.shape == (25,)
+        and 6 + given.own.size <= width
+        and (not n or (local.min() >= 0 and given.source.max() < given.jacobian.shape[2]))
+        and (not given.own.size or (given.own.min() >= 0 and given.own.max() < 3 + len(given.d_extra)))
+        and (not (given.own >= 3).any() or not n or local.max() < num_all)
+    )
+    if function is None or not is_sound:
+        return False
+    function(
+        *(n, width, given.jacobian.shape[2], num_all, given.own.size, given.facts, given.own, given.jacobian),
+        *(given.source, given.first, given.xyz_world, np.ascontiguousarray(given.xy_px)),
+        *(np.ascontiguousarray(given.d_extra), out),
+    )
+    return True
+
+
+def point_information(
+    jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int
+) -> FloatArray | None:
+    """V (P, 3, 3): sum of w J^T J over a point's views, of J (2, 3, n); None for the numpy path."""
+    function = kernel("joint_information", Size, Size, Doubles, Doubles, SmallInts, Doubles)
+    n = weight.size
+    if function is None or jacobian.shape != (2, 3, n) or not jacobian.flags.c_contiguous:
+        return None
+    index = _small_ints(point_idx, n)
+    if n and not (0 <= int(index.min()) and int(index.max()) < num_points):
+        return None
+    out = np.empty((num_points, 3, 3))
+    function(n, num_points, jacobian, np.ascontiguousarray(weight), index, out)
+    return out
+
+
+def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) -> FloatArray | None:
+    """(P,) determinants of (P, 3, 3) scaled to unit diagonal; inverts them in place where asked to. None: numpy path.
+
+    Parameters
+    ----------
+    smallest : squares of the scale below it count as it
+    """
+    function = kernel("joint_invert", Size, Doubles, Doubles, ctypes.c_double, Size)
+    if function is None:
+        return None
+    out = np.empty(len(matrices))
+    function(len(matrices), matrices, out, smallest, int(invert))
+    return out
+
+
+def near_entries(place: IntArray, width: int, near: list[FloatArray]) -> FloatArray | None:
+    """(s, s) entries at sorted places of a banded symmetric matrix; None where not all are at hand, or without kernels.
+
+    Parameters
+    ----------
+    near : per block of ``width`` rows, its entries at the columns of the block and of those behind it
+    """
+    function = kernel("joint_near_entries", Size, Ints, Size, Ints, Ints, Size, Doubles)
+    if function is None or not all(block.flags.c_contiguous for block in near):
+        return None
+    addresses = np.array([block.ctypes.data for block in near], dtype=np.int64)
+    columns = np.array([block.shape[1] for block in near], dtype=np.int64)
+    out = np.empty((place.size, place.size))
+    return out if function(place.size, place, width, addresses, columns, len(near), out) == DONE else None
+
+
+def dense_entries(matrix: FloatArray, columns: IntArray) -> FloatArray | None:
+    """(s, s) entries of a symmetric matrix (D, D), in C or Fortran order, at some columns; None for the numpy path."""
+    function = kernel("joint_dense_entries", Size, Ints, Size, Doubles, Doubles)
+    in_order = matrix if matrix.flags.c_contiguous else matrix.T
+    if function is None or not in_order.flags.c_contiguous:
+        return None
+    out = np.empty((columns.size, columns.size))
+    status = function(columns.size, np.ascontiguousarray(columns, dtype=np.int64), len(matrix), in_order, out)
+    return out if status == DONE else None
+
+
+def has_joint_kernels() -> bool:
+    """Whether the sums come from the compiled library."""
+    return library() is not None
+
+
+def _first_views(held: dict[str, Any]) -> BoolArray:
+    """(n,) whether no earlier row of the image shows the same point; rows of a point are in order."""
+    by_point, image = held["by_point"], held["image_of"]
+    again = np.zeros(by_point.size, dtype=bool)
+    point = held["point_idx"].take(by_point)
+    again[1:] = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
+    out = np.ones(by_point.size, dtype=bool)
+    out[by_point[again]] = False
+    return out
+
+
+def _ints(values: IntArray, size: int) -> IntArray:
+    out = np.ascontiguousarray(values, dtype=np.int64)
+    if out.shape != (size,):
+        raise ValueError(f"expected {size} indices, found shape {out.shape}")
+    return out
+
+
+def _small_ints(values: IntArray, size: int) -> SmallIntArray:
+    """C follows them without looking: the conversion must lose nothing."""
+    if size >= 2**31:
+        raise ValueError(f"expected fewer than 2^31 observations, found {size}")
+    if values.dtype != np.int32 and values.size and not (-(2**31) <= int(values.min()) and int(values.max()) < 2**31):
+        raise ValueError("indices do not fit 32 bits")
+    out = np.ascontiguousarray(values, dtype=np.int32)
+    if out.shape != (size,):
+        raise ValueError(f"expected {size} indices, found shape {out.shape}")
+    return out
+
+
+def _doubles(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    out = np.ascontiguousarray(values, dtype=np.float64)
+    if out.shape != shape:
+        raise ValueError(f"expected an array of shape {shape}, found {out.shape}")
+    return out
+
+
+def _check_indices(held: dict[str, Any], num_images: int, num_points: int) -> None:
+    """C follows them without looking."""
+    num_rows = len(held["image_idx"])
+    for name, limit in (("image_idx", num_images), ("point_idx", num_points), ("by_point", num_rows)):
+        values = held[name]
+        if values.size and not (values.min() >= 0 and values.max() < limit):
+            raise ValueError(f"{name}: expected 0 .. {limit - 1}, found {values.min()} .. {values.max()}")
+    for name in ("offsets", "point_offsets"):
+        ends = held[name]
+        if ends[0] != 0 or ends[-1] != num_rows or (np.diff(ends) < 0).any():
+            raise ValueError(f"{name}: expected to rise from 0 to {num_rows}")

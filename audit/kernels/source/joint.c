@@ -1,0 +1,716 @@
+/* The sums of the joint system (docs/method.md sections 11 and 11b; audit/joint/normal.py and candidates.py are the numpy
+ * twins). An image's points and everybody who sees them are gone through image by image, so that what is added to stays
+ * in the first cache. */
+#include "kernel.h"
+
+typedef double wide __attribute__((vector_size(32), aligned(8), may_alias));
+
+enum { LANES = 4, SCALAR = 16, DENSE = 12, FIELDS = 2 * SCALAR + DENSE, ROWS = 8, MOST_COLUMNS = 32, AHEAD = 8 };
+
+#define LOAD(address) (*(const wide *)(address))
+#define STORE(address) (*(wide *)(address))
+
+/* The model as JointObservations holds it. Arrays are C-contiguous; the Python module has checked all indices. */
+typedef struct {
+    int64_t num_images, width;
+    const int64_t *offsets, *point_offsets;
+    const int32_t *image_idx, *point_idx, *by_point;
+    const int32_t *image_of;     /* (n) in the order of by_point */
+    const double *design;        /* (n, 2, width) */
+    const double *weight;        /* (n) */
+    const double *other_weight;  /* (n) of the second system, see joint_normal */
+    const double *left;          /* (n, 2) */
+    const double *point_inverse; /* (P, 3, 3) */
+    const double *other_inverse; /* (P, 3, 3) */
+    const int64_t *extra_first;  /* (I) first number in extra, -1 without included fields */
+    const int64_t *extra_width;  /* (I) */
+    const double *extra;         /* per image (n_i, 2, r) */
+} joint_model;
+
+/* Who sees the points of an image: views (v) by image, which row of the image's own shows the point, who they are. */
+typedef struct {
+    int32_t *view, *own;
+    int64_t *image, *start; /* (m), (m + 1) */
+    int64_t num_images, num_views;
+} surroundings;
+
+static int by_number(const void *left, const void *right) {
+    int64_t a = *(const int64_t *)left, b = *(const int64_t *)right;
+    return (a > b) - (a < b);
+}
+
+/* Collect the views of the points of rows first <= row < last of an image, those of images before `from` left out. A point
+ * that the image shows twice has its views twice, once for each of the rows. place: (num_images) zeros, zeros again at the
+ * end. */
+static void collect(const joint_model *m, int64_t first, int64_t last, int64_t from, int64_t *place, surroundings *out) {
+    int64_t count = 0, total = 0;
+    for (int64_t row = first; row < last; row++) {
+        int64_t point = m->point_idx[row];
+        if (row + 2 * AHEAD < last) SOON(m->point_offsets + m->point_idx[row + 2 * AHEAD]);
+        if (row + AHEAD < last) SOON(m->image_of + m->point_offsets[m->point_idx[row + AHEAD]]);
+        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
+            int64_t image = m->image_of[k];
+            if (image >= from && !place[image]++) out->image[count++] = image;
+        }
+    }
+    qsort(out->image, (size_t)count, sizeof *out->image, by_number);
+    for (int64_t k = 0; k < count; k++) {
+        int64_t here = place[out->image[k]];
+        out->start[k] = place[out->image[k]] = total;
+        total += here;
+    }
+    out->start[count] = total;
+    out->num_images = count, out->num_views = total;
+    for (int64_t row = first; row < last; row++) {
+        int64_t point = m->point_idx[row];
+        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
+            int64_t image = m->image_of[k];
+            if (image >= from) {
+                out->view[place[image]] = m->by_point[k];
+                out->own[place[image]++] = (int32_t)(row - first);
+            }
+        }
+    }
+    for (int64_t k = 0; k < count; k++) place[out->image[k]] = 0;
+}
+
+
+
+/* Rows of views follow each other at random: ask for those that come soon. */
+static inline void soon(const joint_model *m, const int32_t *view, int64_t j, int64_t end) {
+    if (j + AHEAD < end) {
+        const double *design = m->design + view[j + AHEAD] * 2 * m->width;
+        for (int64_t c = 0; c < 2 * m->width + 8; c += 8) SOON(design + (c < 2 * m->width ? c : 2 * m->width - 1));
+        SOON(m->weight + view[j + AHEAD]);
+    }
+}
+
+/* Rows of a view: (2, width) of its design, or of the included fields of its image. */
+typedef struct {
+    const double *base;
+    int64_t first_row, width;
+} row_block;
+
+static inline const double *rows_of(row_block block, int64_t view) {
+    return block.base + (view - block.first_row) * 2 * block.width;
+}
+
+/* Two rows of numbers, padded with zeros so that loops over them have a length that the compiler knows. */
+typedef struct {
+    double x[MOST_COLUMNS], y[MOST_COLUMNS];
+} pair_of_rows;
+
+static inline __attribute__((always_inline)) void take_rows(
+    const double *x, const double *y, int64_t count, pair_of_rows *out) {
+    for (int64_t c = 0; c < count; c++) out->x[c] = x[c], out->y[c] = y[c];
+}
+
+/* out (num, 2, ROWS): w J^T times chosen columns of the rows, through A (3, 2) of the own observation.
+ * scores (num, width): w rows^T y~. */
+static inline __attribute__((always_inline)) void crossed(
+    const joint_model *m, const int32_t *view, const int32_t *own, int64_t num, row_block block, int64_t column,
+    const double *absorbing, double *out, double *scores) {
+    int64_t count = block.width - column < ROWS ? block.width - column : ROWS;
+    pair_of_rows pair = {{0.0}, {0.0}};
+    for (int64_t k = 0; k < num; k++, out += 2 * ROWS) {
+        soon(m, view, k, num);
+        if (k + AHEAD < num) SOON(m->left + 2 * view[k + AHEAD]);
+        const double *design = m->design + view[k] * 2 * m->width, *rows = rows_of(block, view[k]) + column;
+        const double *a = absorbing + 6 * own[k], *jx = design + 3, *jy = design + m->width + 3;
+        double w = m->weight[view[k]];
+        /* J A (2, 2): what moving the point by A does to this view */
+        double xx = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]), xy = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+        double yx = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), yy = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+        if (count == ROWS) take_rows(rows, rows + block.width, ROWS, &pair);
+        else take_rows(rows, rows + block.width, count, &pair);
+        for (int c = 0; c < ROWS; c++) out[c] = pair.x[c] * xx + pair.y[c] * yx;
+        for (int c = 0; c < ROWS; c++) out[ROWS + c] = pair.x[c] * xy + pair.y[c] * yy;
+        double x = w * m->left[2 * view[k]], y = w * m->left[2 * view[k] + 1], *score = scores + k * block.width + column;
+        for (int64_t c = 0; c < count; c++) score[c] = pair.x[c] * x + pair.y[c] * y;
+    }
+}
+
+/* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. */
+static inline __attribute__((always_inline)) void subtract_fields(
+    const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
+    double *out) {
+    for (int64_t c = 0; c < count; c++) {
+        wide x0 = {0}, x1 = {0}, x2 = {0}, x3 = {0}, y0 = {0}, y1 = {0}, y2 = {0}, y3 = {0}, d0 = {0}, d1 = {0}, d2 = {0};
+        for (int64_t k = 0; k < num; k++) {
+            const double *f = scalar + SCALAR * own[k], *d = dense + 2 * DENSE * own[k];
+            double alongx = through[2 * ROWS * k + c], alongy = through[2 * ROWS * k + ROWS + c];
+            wide ax = {alongx, alongx, alongx, alongx}, ay = {alongy, alongy, alongy, alongy};
+            wide f0 = LOAD(f), f1 = LOAD(f + 4), f2 = LOAD(f + 8), f3 = LOAD(f + 12);
+            x0 += ax * f0, x1 += ax * f1, x2 += ax * f2, x3 += ax * f3;
+            y0 += ay * f0, y1 += ay * f1, y2 += ay * f2, y3 += ay * f3;
+            d0 += ax * LOAD(d) + ay * LOAD(d + DENSE);
+            d1 += ax * LOAD(d + 4) + ay * LOAD(d + DENSE + 4);
+            d2 += ax * LOAD(d + 8) + ay * LOAD(d + DENSE + 8);
+        }
+        double *o = out + FIELDS * c;
+        STORE(o) -= x0, STORE(o + 4) -= x1, STORE(o + 8) -= x2, STORE(o + 12) -= x3;
+        STORE(o + 16) -= y0, STORE(o + 20) -= y1, STORE(o + 24) -= y2, STORE(o + 28) -= y3;
+        STORE(o + 32) -= d0, STORE(o + 36) -= d1, STORE(o + 40) -= d2;
+    }
+}
+
+/* Sums of products of own fields with weights P (2, 2): half of E^T P E. */
+typedef struct {
+    double xx[SCALAR][SCALAR], xy[SCALAR][SCALAR], yy[SCALAR][SCALAR], plain[SCALAR][SCALAR];
+    double xd[SCALAR][DENSE], yd[SCALAR][DENSE], dd[DENSE][DENSE];
+    double dense_plain[DENSE][DENSE];
+} own_gram;
+
+static inline __attribute__((always_inline)) void add_gram(
+    own_gram *g, const double *f, const double *d, double w, double pxx, double pxy, double pyy) {
+    double dx[DENSE], dy[DENSE];
+    for (int j = 0; j < DENSE; j++) {
+        double x = d[j], y = d[DENSE + j];
+        dx[j] = pxx * x + pxy * y, dy[j] = pxy * x + pyy * y;
+    }
+    for (int i = 0; i < SCALAR; i++) {
+        double xx = pxx * f[i], xy = pxy * f[i], yy = pyy * f[i], plain = w * f[i];
+        for (int j = i / LANES * LANES; j < SCALAR; j++) {
+            g->xx[i][j] += xx * f[j], g->xy[i][j] += xy * f[j], g->yy[i][j] += yy * f[j], g->plain[i][j] += plain * f[j];
+        }
+        for (int j = 0; j < DENSE; j++) g->xd[i][j] += f[i] * dx[j], g->yd[i][j] += f[i] * dy[j];
+    }
+    for (int i = 0; i < DENSE; i++) {
+        double x = w * d[i], y = w * d[DENSE + i];
+        for (int j = 0; j < DENSE; j++) g->dd[i][j] += d[i] * dx[j] + d[DENSE + i] * dy[j];
+        for (int j = i / LANES * LANES; j < DENSE; j++) g->dense_plain[i][j] += x * d[j] + y * d[DENSE + j];
+    }
+}
+
+/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, and w E^T E of the scalars and of the dense fields. */
+static void spread_gram(const own_gram *g, double *gram, double *plain, double *dense_plain) {
+    for (int i = 0; i < SCALAR; i++) {
+        for (int j = 0; j < SCALAR; j++) {
+            int a = i < j ? i : j, b = i < j ? j : i;
+            gram[i * FIELDS + j] = g->xx[a][b];
+            gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->xy[a][b];
+            gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->yy[a][b];
+            plain[i * SCALAR + j] = g->plain[a][b];
+        }
+        for (int j = 0; j < DENSE; j++) {
+            gram[i * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + i] = g->xd[i][j];
+            gram[(SCALAR + i) * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + SCALAR + i] = g->yd[i][j];
+        }
+    }
+    for (int i = 0; i < DENSE; i++) {
+        for (int j = 0; j < DENSE; j++) gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = g->dd[i][j];
+        for (int j = 0; j < DENSE; j++) dense_plain[i * DENSE + j] = i < j ? g->dense_plain[i][j] : g->dense_plain[j][i];
+    }
+}
+
+/* (FIELDS) vector E^T v of one observation, v (2). */
+static inline __attribute__((always_inline)) void add_along(double *out, const double *f, const double *d, double x, double y) {
+    for (int i = 0; i < SCALAR; i++) out[i] += f[i] * x, out[SCALAR + i] += f[i] * y;
+    for (int i = 0; i < DENSE; i++) out[2 * SCALAR + i] += d[i] * x + d[DENSE + i] * y;
+}
+
+/* Two rows of an image that show one point: the part of (J^T E)^T V^-1 (J^T E) that both have together. */
+static void subtract_pair(double *gram, const double *fi, const double *di, const double *fj, const double *dj, const double *p) {
+    double left[FIELDS][2], right[FIELDS][2];
+    for (int side = 0; side < 2; side++) {
+        const double *f = side ? fj : fi, *d = side ? dj : di;
+        double(*to)[2] = side ? right : left;
+        for (int c = 0; c < SCALAR; c++) to[c][0] = f[c], to[c][1] = 0.0, to[SCALAR + c][0] = 0.0, to[SCALAR + c][1] = f[c];
+        for (int c = 0; c < DENSE; c++) to[2 * SCALAR + c][0] = d[c], to[2 * SCALAR + c][1] = d[DENSE + c];
+    }
+    for (int a = 0; a < FIELDS; a++) {
+        double x = left[a][0] * p[0] + left[a][1] * p[2], y = left[a][0] * p[1] + left[a][1] * p[3];
+        for (int b = 0; b < FIELDS; b++) {
+            double value = x * right[b][0] + y * right[b][1];
+            gram[a * FIELDS + b] -= value, gram[b * FIELDS + a] -= value;
+        }
+    }
+}
+
+/* w V^-1 J^T (3, 2) of an observation. */
+static inline void absorb(const joint_model *m, int64_t row, double *a) {
+    const double *design = m->design + row * 2 * m->width, *v = m->point_inverse + 9 * m->point_idx[row];
+    double w = m->weight[row];
+    for (int i = 0; i < 3; i++) {
+        for (int axis = 0; axis < 2; axis++) {
+            const double *j = design + axis * m->width + 3;
+            a[2 * i + axis] = w * (v[3 * i] * j[0] + v[3 * i + 1] * j[1] + v[3 * i + 2] * j[2]);
+        }
+    }
+}
+
+/* What an image's candidate fields are to the base, before S^+ (first half of candidate_scores).
+ *
+ * scalar (n_i, SCALAR), dense (n_i, 2, DENSE): its fields: SCALAR functions in x, the same in y, DENSE with both.
+ * track (n_i): which of its distinct points t a row shows; -1 - t where another row shows it first; num_tracks of them.
+ * place (num_images): zeros, and zeros again afterwards.
+ * Out: view (v), own (v), image (m), start (m + 1): see surroundings; num (2): m and rows of right.
+ * absorbing (n_i, 3, 2).    right (rows, FIELDS): N^T E - W V^-1 J^T E without T, by image around: its design's columns,
+ * then its included fields.    gram (FIELDS, FIELDS).    plain (SCALAR, SCALAR), dense_plain (DENSE, DENSE): E^T w E.
+ * score (FIELDS): E^T y~.    track_score (num_tracks, FIELDS): the same by track.
+ * scores (max_scores): w rows^T y~ of all views, by image around: those of the design, then those of its included fields. */
+WIDE KERNEL int64_t joint_first(
+    const joint_model *m, int64_t *place, int64_t image, const double *scalar, const double *dense, const int32_t *track,
+    int64_t num_tracks, int64_t max_rows, int32_t *view, int32_t *own, int64_t *around, int64_t *start,
+    int64_t *num, double *absorbing, double *right, double *gram, double *plain, double *dense_plain, double *score,
+    double *track_score, double *scores, int64_t max_scores) {
+    int64_t first = m->offsets[image], last = m->offsets[image + 1], n = last - first;
+    surroundings near = {view, own, around, start, 0, 0};
+    collect(m, first, last, 0, place, &near);
+    int64_t most = 1;
+    for (int64_t k = 0; k < near.num_images; k++) most = start[k + 1] - start[k] > most ? start[k + 1] - start[k] : most;
+    double *through = malloc((size_t)most * 2 * ROWS * sizeof *through);
+    own_gram *sums = calloc(1, sizeof *sums);
+    if (!through || !sums) {
+        free(through), free(sums);
+        return NO_MEMORY;
+    }
+    memset(track_score, 0, (size_t)num_tracks * FIELDS * sizeof *track_score);
+    memset(score, 0, FIELDS * sizeof *score);
+    for (int64_t i = 0; i < n; i++) {
+        const double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i;
+        const double *jx = m->design + (first + i) * 2 * m->width + 3, *jy = jx + m->width;
+        double w = m->weight[first + i], *a = absorbing + 6 * i;
+        if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[first + i + AHEAD]);
+        absorb(m, first + i, a);
+        double pxx = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
+        double pxy = -w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+        double pyy = w - w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+        add_gram(sums, f, d, w, pxx, pxy, pyy);
+        int64_t t = track[i] < 0 ? -1 - track[i] : track[i];
+        add_along(track_score + FIELDS * t, f, d, w * m->left[2 * (first + i)], w * m->left[2 * (first + i) + 1]);
+    }
+    for (int64_t t = 0; t < num_tracks; t++) {
+        for (int c = 0; c < FIELDS; c++) score[c] += track_score[t * FIELDS + c];
+    }
+    spread_gram(sums, gram, plain, dense_plain);
+    int64_t rows = 0, used = 0, status = DONE;
+    for (int64_t k = 0; k < near.num_images && status == DONE; k++) {
+        int64_t other = around[k], begin = start[k], count = start[k + 1] - begin;
+        row_block blocks[2] = {{m->design, 0, m->width}, {NULL, m->offsets[other], 0}};
+        if (m->extra_first[other] >= 0) {
+            blocks[1].base = m->extra + m->extra_first[other], blocks[1].width = m->extra_width[other];
+        }
+        used += count * (blocks[0].width + blocks[1].width);
+        if (rows + blocks[0].width + blocks[1].width > max_rows || used > max_scores) {
+            status = NEEDS_NUMPY;
+            break;
+        }
+        for (int b = 0; b < 2; b++) {
+            double *to = right + rows * FIELDS;
+            memset(to, 0, (size_t)blocks[b].width * FIELDS * sizeof *to);
+            for (int64_t column = 0; column < blocks[b].width; column += ROWS) {
+                int64_t wide_count = blocks[b].width - column < ROWS ? blocks[b].width - column : ROWS;
+                crossed(m, view + begin, own + begin, count, blocks[b], column, absorbing, through, scores);
+                subtract_fields(own + begin, count, wide_count, through, scalar, dense, to + column * FIELDS);
+            }
+            scores += count * blocks[b].width;
+            if (other == image) {
+                for (int64_t i = 0; i < n; i++) {
+                    const double *r = rows_of(blocks[b], first + i);
+                    double w = m->weight[first + i];
+                    for (int64_t c = 0; c < blocks[b].width; c++) {
+                        add_along(to + c * FIELDS, scalar + SCALAR * i, dense + 2 * DENSE * i, w * r[c], w * r[blocks[b].width + c]);
+                    }
+                }
+            }
+            rows += blocks[b].width;
+        }
+        for (int64_t j = begin; other == image && j < start[k + 1]; j++) {
+            int64_t i = view[j] - first, l = own[j]; /* another own row that shows the same point */
+            if (i < l) {
+                const double *jx = m->design + view[j] * 2 * m->width + 3, *jy = jx + m->width, *a = absorbing + 6 * l;
+                double w = m->weight[view[j]], p[4];
+                p[0] = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]), p[1] = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+                p[2] = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), p[3] = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+                subtract_pair(gram, scalar + SCALAR * i, dense + 2 * DENSE * i, scalar + SCALAR * l, dense + 2 * DENSE * l, p);
+            }
+        }
+    }
+    num[0] = near.num_images, num[1] = rows;
+    free(through), free(sums);
+    return status;
+}
+
+/* The scores of the tracks minus what the base does with them (second half of candidate_scores), in place.
+ *
+ * moved (rows, FIELDS): T B of each image around, in the order of joint_first's right.    track, scores: of joint_first. */
+WIDE KERNEL int64_t joint_second(
+    const joint_model *m, int64_t num_around, const int32_t *own, const int64_t *around, const int64_t *start,
+    const int32_t *track, const double *scores, const double *moved, double *track_score) {
+    for (int64_t k = 0; k < num_around; k++) {
+        int64_t widths[2] = {m->width, m->extra_first[around[k]] >= 0 ? m->extra_width[around[k]] : 0};
+        for (int b = 0; b < 2; b++) {
+            int64_t width = widths[b];
+            for (int64_t j = start[k]; width && j < start[k + 1]; j++, scores += width) {
+                if (track[own[j]] < 0) continue; /* the track had this view already */
+                double *to = track_score + FIELDS * track[own[j]];
+                wide s0 = LOAD(to), s1 = LOAD(to + 4), s2 = LOAD(to + 8), s3 = LOAD(to + 12), s4 = LOAD(to + 16);
+                wide s5 = LOAD(to + 20), s6 = LOAD(to + 24), s7 = LOAD(to + 28), s8 = LOAD(to + 32), s9 = LOAD(to + 36);
+                wide s10 = LOAD(to + 40);
+                for (int64_t c = 0; c < width; c++) {
+                    const double *from = moved + c * FIELDS;
+                    wide h = {scores[c], scores[c], scores[c], scores[c]};
+                    s0 -= h * LOAD(from), s1 -= h * LOAD(from + 4), s2 -= h * LOAD(from + 8), s3 -= h * LOAD(from + 12);
+                    s4 -= h * LOAD(from + 16), s5 -= h * LOAD(from + 20), s6 -= h * LOAD(from + 24), s7 -= h * LOAD(from + 28);
+                    s8 -= h * LOAD(from + 32), s9 -= h * LOAD(from + 36), s10 -= h * LOAD(from + 40);
+                }
+                STORE(to) = s0, STORE(to + 4) = s1, STORE(to + 8) = s2, STORE(to + 12) = s3, STORE(to + 16) = s4;
+                STORE(to + 20) = s5, STORE(to + 24) = s6, STORE(to + 28) = s7, STORE(to + 32) = s8, STORE(to + 36) = s9;
+                STORE(to + 40) = s10;
+            }
+            moved += width * FIELDS;
+        }
+    }
+    return DONE;
+}
+
+/* One pair of systems: the robust weights and those of the second system. `padded` is the width, rounded up to LANES.
+ *
+ * slab, other_slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows), W from
+ * the design without T. */
+static inline __attribute__((always_inline)) void add_slab(
+    const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
+    const double *other_absorbed, double *slab, double *other_slab) {
+    int64_t width = m->width;
+    pair_of_rows pair = {{0.0}, {0.0}};
+    double along[3][MOST_COLUMNS];
+    for (int64_t j = near->start[k]; j < near->start[k + 1]; j++) {
+        soon(m, near->view, j, near->start[k + 1]);
+        const double *dx = m->design + near->view[j] * 2 * width, *dy = dx + width;
+        const double *own = absorbed + 3 * padded * near->own[j], *other = other_absorbed + 3 * padded * near->own[j];
+        double w = m->weight[near->view[j]], plain = m->other_weight[near->view[j]];
+        take_rows(dx, dy, width, &pair);
+        for (int i = 0; i < 3; i++) {
+            double x = dx[3 + i], y = dy[3 + i];
+            for (int64_t c = 0; c < padded; c++) along[i][c] = pair.x[c] * x + pair.y[c] * y;
+        }
+        for (int64_t c = 0; c < padded; c++) {
+            double a0 = w * along[0][c], a1 = w * along[1][c], a2 = w * along[2][c];
+            double b0 = plain * along[0][c], b1 = plain * along[1][c], b2 = plain * along[2][c];
+            wide p0 = {a0, a0, a0, a0}, p1 = {a1, a1, a1, a1}, p2 = {a2, a2, a2, a2};
+            wide q0 = {b0, b0, b0, b0}, q1 = {b1, b1, b1, b1}, q2 = {b2, b2, b2, b2};
+            double *to = slab + c * padded, *other_to = other_slab + c * padded;
+            for (int64_t d = 0; d < padded; d += LANES) {
+                STORE(to + d) -= p0 * LOAD(own + d) + p1 * LOAD(own + padded + d) + p2 * LOAD(own + 2 * padded + d);
+                STORE(other_to + d) -= q0 * LOAD(other + d) + q1 * LOAD(other + padded + d) + q2 * LOAD(other + 2 * padded + d);
+            }
+        }
+    }
+}
+
+/* V^-1 W^T (3, padded) of a row. */
+static inline void absorb_row(
+    const joint_model *m, int64_t row, int64_t padded, const double *weight, const double *inverse, double *out) {
+    const double *dx = m->design + row * 2 * m->width, *dy = dx + m->width, *v = inverse + 9 * m->point_idx[row];
+    for (int i = 0; i < 3; i++) {
+        double x = weight[row] * (v[3 * i] * dx[3] + v[3 * i + 1] * dx[4] + v[3 * i + 2] * dx[5]);
+        double y = weight[row] * (v[3 * i] * dy[3] + v[3 * i + 1] * dy[4] + v[3 * i + 2] * dy[5]);
+        for (int64_t d = 0; d < padded; d++) out[i * padded + d] = d < m->width ? x * dx[d] + y * dy[d] : 0.0;
+    }
+}
+
+/* (padded, padded) to (width, width). */
+static void trim(const double *from, int64_t padded, int64_t width, double scale, double *out) {
+    for (int64_t c = 0; c < width; c++) {
+        for (int64_t d = 0; d < width; d++) out[c * width + d] = scale * from[c * padded + d];
+    }
+}
+
+/* gram (width, width) += design^T w design, right (width) += design^T w cleaned, of an image's own rows. */
+static inline __attribute__((always_inline)) void add_own(
+    const joint_model *m, int64_t width, int64_t first, int64_t last, const double *weight, const double *cleaned,
+    double *gram, double *right) {
+    memset(gram, 0, (size_t)(width * width) * sizeof *gram);
+    memset(right, 0, (size_t)width * sizeof *right);
+    for (int64_t row = first; row < last; row++) {
+        const double *dx = m->design + row * 2 * width, *dy = dx + width;
+        double w = weight[row], x = w * cleaned[2 * row], y = w * cleaned[2 * row + 1];
+        for (int64_t c = 0; c < width; c++) {
+            double wx = w * dx[c], wy = w * dy[c];
+            right[c] += dx[c] * x + dy[c] * y;
+            for (int64_t d = 0; d < width; d++) gram[c * width + d] += wx * dx[d] + wy * dy[d];
+        }
+    }
+}
+
+/* What an image adds to the normal equations without the points, of both systems (reduced_systems of audit/joint/normal.py).
+ *
+ * cleaned, other_cleaned (n, 2): residuals off the points. eliminate: 0 where points are independent.
+ * Out: around (m), num (1): m; slabs as add_slab; grams (2, width, width), rights (2, width). */
+WIDE KERNEL int64_t joint_normal(
+    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *cleaned,
+    const double *other_cleaned, int64_t *around, int64_t *num, double *slab, double *other_slab, double *grams,
+    double *rights) {
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
+    int64_t padded = (width + LANES - 1) / LANES * LANES, size = padded * padded;
+    if (padded > MOST_COLUMNS) return NEEDS_NUMPY;
+    int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
+    int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
+    double *absorbed = malloc((size_t)(6 * padded * n + 1) * sizeof *absorbed), *other = absorbed + 3 * padded * n;
+    int64_t status = view && start && own && absorbed ? DONE : NO_MEMORY;
+    if (status == DONE) {
+        surroundings near = {view, own, around, start, 0, 0};
+        collect(m, first, first + n, image, place, &near);
+        for (int64_t i = 0; i < n; i++) {
+            if (i + AHEAD < n) {
+                int64_t point = m->point_idx[first + i + AHEAD];
+                SOON(m->point_inverse + 9 * point), SOON(m->point_inverse + 9 * point + 8);
+                SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
+            }
+            absorb_row(m, first + i, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
+            absorb_row(m, first + i, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
+        }
+        for (int64_t k = 0; k < near.num_images; k++) {
+            double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
+            memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
+            if (padded == 8) add_slab(m, 8, &near, k, absorbed, other, here[0], here[1]);
+            else if (padded == 12) add_slab(m, 12, &near, k, absorbed, other, here[0], here[1]);
+            else add_slab(m, padded, &near, k, absorbed, other, here[0], here[1]);
+            trim(here[0], padded, width, scale, slab + k * width * width);
+            trim(here[1], padded, width, scale, other_slab + k * width * width);
+        }
+        num[0] = near.num_images;
+        for (int which = 0; which < 2; which++) {
+            const double *weight = which ? m->other_weight : m->weight, *values = which ? other_cleaned : cleaned;
+            double *gram = grams + which * width * width, *right = rights + which * width;
+            if (width == 8) add_own(m, 8, first, first + n, weight, values, gram, right);
+            else add_own(m, width, first, first + n, weight, values, gram, right);
+        }
+    }
+    free(view), free(start), free(own), free(absorbed);
+    return status;
+}
+
+/* slab (m, width, width): sum over tracks of s_k s^T, s the sum of w design^T y~ over an image's views of a track, between an
+ * image (columns) and everybody behind it (rows); its own one is halved (score_meat). track: as in joint_first. */
+WIDE KERNEL int64_t joint_meat(
+    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const int32_t *track, int64_t num_tracks,
+    int64_t *around, int64_t *num, double *slab) {
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
+    int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
+    int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
+    double *scores = calloc((size_t)(num_tracks * width + 1), sizeof *scores);
+    int64_t status = view && start && own && scores ? DONE : NO_MEMORY;
+    if (status == DONE) {
+        surroundings near = {view, own, around, start, 0, 0};
+        collect(m, first, first + n, image, place, &near);
+        for (int64_t i = 0; i < n; i++) {
+            const double *dx = m->design + (first + i) * 2 * width, *dy = dx + width;
+            double x = m->weight[first + i] * m->left[2 * (first + i)], y = m->weight[first + i] * m->left[2 * (first + i) + 1];
+            double *to = scores + width * (track[i] < 0 ? -1 - track[i] : track[i]);
+            for (int64_t c = 0; c < width; c++) to[c] += dx[c] * x + dy[c] * y;
+        }
+        memset(slab, 0, (size_t)(near.num_images * width * width) * sizeof *slab);
+        for (int64_t k = 0; k < near.num_images; k++) {
+            for (int64_t j = start[k]; j < start[k + 1]; j++) {
+                soon(m, view, j, start[k + 1]);
+                if (j + AHEAD < start[k + 1]) SOON(m->left + 2 * view[j + AHEAD]);
+                if (track[own[j]] < 0) continue;
+                const double *dx = m->design + view[j] * 2 * width, *dy = dx + width, *s = scores + width * track[own[j]];
+                double w = m->weight[view[j]], x = w * m->left[2 * view[j]], y = w * m->left[2 * view[j] + 1];
+                for (int64_t c = 0; c < width; c++) {
+                    double value = dx[c] * x + dy[c] * y, *to = slab + (k * width + c) * width;
+                    for (int64_t d = 0; d < width; d++) to[d] += value * s[d];
+                }
+            }
+        }
+        for (int64_t c = 0; near.num_images && c < width * width; c++) slab[c] *= 0.5;
+        num[0] = near.num_images;
+    }
+    free(view), free(start), free(own), free(scores);
+    return status;
+}
+
+/* V (P, 3, 3): sum of w J^T J over a point's views; jacobian (2, 3, n) and weight (n) are of all observations. Where the
+ * weight is zero nothing is added, whatever the derivatives. */
+KERNEL int64_t joint_information(
+    int64_t n, int64_t num_points, const double *jacobian, const double *weight, const int32_t *point_idx, double *out) {
+    memset(out, 0, (size_t)(9 * num_points) * sizeof *out);
+    for (int64_t k = 0; k < n; k++) {
+        double w = weight[k], *v = out + 9 * point_idx[k];
+        if (w == 0.0) continue;
+        double x[3], y[3];
+        for (int i = 0; i < 3; i++) x[i] = jacobian[i * n + k], y[i] = jacobian[(3 + i) * n + k];
+        for (int i = 0; i < 3; i++) {
+            for (int j = i; j < 3; j++) v[3 * i + j] += w * (x[i] * x[j] + y[i] * y[j]);
+        }
+    }
+    for (int64_t p = 0; p < num_points; p++) {
+        double *v = out + 9 * p;
+        v[3] = v[1], v[6] = v[2], v[7] = v[5];
+    }
+    return DONE;
+}
+
+/* Determinants (P) of the matrices (P, 3, 3) scaled to unit diagonal; with invert their inverses in place, too: zero stays
+ * zero. smallest: squares below it count as it. */
+KERNEL int64_t joint_invert(int64_t num_points, double *matrices, double *determinant, double smallest, int64_t invert) {
+    for (int64_t p = 0; p < num_points; p++) {
+        double *v = matrices + 9 * p, s[3];
+        for (int i = 0; i < 3; i++) s[i] = sqrt(v[4 * i] > smallest ? v[4 * i] : smallest);
+        double a = v[0] / s[0] / s[0], b = v[1] / s[0] / s[1], c = v[2] / s[0] / s[2];
+        double d = v[4] / s[1] / s[1], e = v[5] / s[1] / s[2], f = v[8] / s[2] / s[2];
+        double co00 = d * f - e * e, co01 = c * e - b * f, co02 = b * e - c * d;
+        double det = a * co00 + b * co01 + c * co02;
+        determinant[p] = det;
+        if (!invert || (v[0] == 0.0 && v[4] == 0.0 && v[8] == 0.0)) continue;
+        double co11 = a * f - c * c, co12 = b * c - a * e, co22 = a * d - b * b, scale = 1.0 / det;
+        v[0] = co00 * scale / s[0] / s[0], v[1] = v[3] = co01 * scale / s[0] / s[1];
+        v[2] = v[6] = co02 * scale / s[0] / s[2], v[4] = co11 * scale / s[1] / s[1];
+        v[5] = v[7] = co12 * scale / s[1] / s[2], v[8] = co22 * scale / s[2] / s[2];
+    }
+    return DONE;
+}
+
+/* steps (P, 3): V^-1 J^T w values (n, 2); cleaned (n, 2): values minus J steps, where asked for (not NULL). */
+KERNEL int64_t joint_off_points(
+    const joint_model *m, const double *weight, const double *inverse, int64_t num_points, const double *values,
+    double *steps, double *cleaned, int64_t with_cleaned) {
+    for (int64_t p = 0; p < num_points; p++) {
+        double pull[3] = {0.0, 0.0, 0.0};
+        for (int64_t k = m->point_offsets[p]; k < m->point_offsets[p + 1]; k++) {
+            int64_t row = m->by_point[k];
+            const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
+            double w = weight[row];
+            for (int i = 0; i < 3; i++) pull[i] += (jx[i] * values[2 * row] + jy[i] * values[2 * row + 1]) * w;
+        }
+        const double *v = inverse + 9 * p;
+        double *s = steps + 3 * p;
+        for (int i = 0; i < 3; i++) s[i] = v[3 * i] * pull[0] + v[3 * i + 1] * pull[1] + v[3 * i + 2] * pull[2];
+        for (int64_t k = m->point_offsets[p]; with_cleaned && k < m->point_offsets[p + 1]; k++) {
+            int64_t row = m->by_point[k];
+            const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
+            cleaned[2 * row] = values[2 * row] - (jx[0] * s[0] + jx[1] * s[1] + jx[2] * s[2]);
+            cleaned[2 * row + 1] = values[2 * row + 1] - (jy[0] * s[0] + jy[1] * s[1] + jy[2] * s[2]);
+        }
+    }
+    return DONE;
+}
+
+/* left (n, 2) -= N step: design times moved (I, width) = T step of each image, row by row. */
+KERNEL int64_t joint_subtract_step(const joint_model *m, const double *moved, double *left) {
+    for (int64_t row = 0; row < m->offsets[m->num_images]; row++) {
+        const double *dx = m->design + row * 2 * m->width, *dy = dx + m->width, *s = moved + m->width * m->image_idx[row];
+        double x = 0.0, y = 0.0;
+        for (int64_t c = 0; c < m->width; c++) x += dx[c] * s[c], y += dy[c] * s[c];
+        left[2 * row] -= x, left[2 * row + 1] -= y;
+    }
+    return DONE;
+}
+
+/* out (I, width): sum over an image's rows of w design^T values (n, 2). */
+KERNEL int64_t joint_along_design(const joint_model *m, const double *values, double *out) {
+    memset(out, 0, (size_t)(m->num_images * m->width) * sizeof *out);
+    for (int64_t row = 0; row < m->offsets[m->num_images]; row++) {
+        const double *dx = m->design + row * 2 * m->width, *dy = dx + m->width;
+        double *to = out + m->width * m->image_idx[row], x = m->weight[row] * values[2 * row], y = m->weight[row] * values[2 * row + 1];
+        for (int64_t c = 0; c < m->width; c++) to[c] += dx[c] * x + dy[c] * y;
+    }
+    return DONE;
+}
+
+/* The fields of an image: scalar (n, SCALAR) 1, x, y, x^2, .. y^4 of the predicted point, 0; dense (n, 2, DENSE): radial,
+ * tangential, design columns times the row coordinate, the next radial term, 0 (audit/misfit/fields.py, audit/joint).
+ *
+ * facts: R (9), t (3) of cam_from_world, fx, fy, half width, half height, half of the larger one, height.
+ * xyz (n, 3) world, predicted (n, 2) px. fisheye: u is theta (X, Y) / rho. power: of r^2 in the next term, 0 for none. */
+WIDE KERNEL int64_t joint_fields(
+    const joint_model *m, int64_t image, const double *facts, const double *xyz, const double *predicted, int64_t fisheye,
+    int64_t power, double *scalar, double *dense) {
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
+    const double *r = facts, *t = facts + 9;
+    double fx = facts[12], fy = facts[13], middle_x = facts[14], middle_y = facts[15], half = facts[16], height = facts[17];
+    for (int64_t i = 0; i < n; i++) {
+        const double *p = xyz + 3 * i, *dx = m->design + (first + i) * 2 * m->width, *dy = dx + m->width;
+        double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i, *e = d + DENSE;
+        double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
+        double u = (r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0]) / z, v = (r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1]) / z;
+        if (!(z >= DBL_EPSILON)) return NEEDS_NUMPY;
+        if (fisheye) {
+            double rho = sqrt(u * u + v * v > DBL_MIN ? u * u + v * v : DBL_MIN), gain = atan(rho) / rho;
+            u *= gain, v *= gain;
+        }
+        double r2 = u * u + v * v, sx = fx * u, sy = fy * v, cross = 2.0 * u * v;
+        double x = (predicted[2 * i] - middle_x) / half, y = (predicted[2 * i + 1] - middle_y) / half;
+        double along = (predicted[2 * i + 1] - middle_y) / height, next = power ? 1.0 : 0.0;
+        f[0] = 1.0, f[1] = x, f[2] = y;
+        for (int degree = 2, k = 3; degree <= 4; degree++) {
+            for (int j = 0; j < degree; j++, k++) f[k] = f[k - degree] * x;
+            f[k] = f[k - degree - 1] * y;
+            k++;
+        }
+        f[15] = 0.0;
+        for (int64_t k = 0; k < power; k++) next *= r2;
+        d[0] = sx * (r2 * r2), e[0] = sy * (r2 * r2), d[1] = d[0] * r2, e[1] = e[0] * r2;
+        d[2] = fx * cross, e[2] = fy * (r2 + 2.0 * v * v), d[3] = fx * (r2 + 2.0 * u * u), e[3] = fy * cross;
+        for (int c = 0; c < 6; c++) d[4 + c] = dx[c] * along, e[4 + c] = dy[c] * along;
+        d[10] = sx * next, e[10] = sy * next, d[11] = 0.0, e[11] = 0.0;
+    }
+    return DONE;
+}
+
+/* out (s, s): entries of a banded symmetric matrix at sorted places (s), from the rows of its blocks.
+ *
+ * near: address of each block's rows (width of the block, columns of it and of those behind it), columns: of each. */
+KERNEL int64_t joint_near_entries(
+    int64_t size, const int64_t *place, int64_t width, const int64_t *near, const int64_t *columns, int64_t num_blocks,
+    double *out) {
+    for (int64_t i = 0; i < size; i++) {
+        int64_t block = place[i] / width, origin = block * width;
+        if (place[i] < 0 || block >= num_blocks || place[size - 1] - origin >= columns[block]) return NEEDS_NUMPY;
+        const double *row = (const double *)(intptr_t)near[block] + (place[i] - origin) * columns[block];
+        for (int64_t j = i; j < size; j++) out[i * size + j] = row[place[j] - origin];
+    }
+    for (int64_t i = 0; i < size; i += ROWS) { /* the other half, in tiles */
+        for (int64_t j = 0; j < i + ROWS && j < size; j++) {
+            for (int64_t k = i; k < i + ROWS && k < size; k++) {
+                if (k > j) out[k * size + j] = out[j * size + k];
+            }
+        }
+    }
+    return DONE;
+}
+
+/* out (s, s): entries of a symmetric matrix (size, size) at some columns (s). */
+KERNEL int64_t joint_dense_entries(int64_t num, const int64_t *columns, int64_t size, const double *matrix, double *out) {
+    for (int64_t i = 0; i < num; i++) {
+        if (columns[i] < 0 || columns[i] >= size) return NEEDS_NUMPY;
+    }
+    for (int64_t i = 0; i < num; i++) {
+        const double *row = matrix + columns[i] * size;
+        for (int64_t j = 0; j < num; j++) out[i * num + j] = row[columns[j]];
+    }
+    return DONE;
+}
+
+/* The design (n, 2, width) of one image: derivatives in the rotation, in the points, in the own parameters; zero padding.
+ *
+ * facts: R (9), its inverse (9), t (3), fx, fy, cx, cy.    own (num_own): 0 focal length of both axes, 1 of x, 2 of y, 3 + e
+ * distortion parameter e.    jacobian (2, 3, total), source (n): its columns.    xyz (n, 3) world, predicted (n, 2) px.
+ * extra (num_extra, 2, all): of all the image's inliers, which (n) among them. */
+KERNEL int64_t joint_design(
+    int64_t n, int64_t width, int64_t total, int64_t all, int64_t num_own, const double *facts, const int64_t *own,
+    const double *jacobian, const int64_t *source, int64_t first, const double *xyz, const double *predicted,
+    const double *extra, double *out) {
+    const double *r = facts, *inverse = facts + 9, *t = facts + 18, *focal = facts + 21, *centre = facts + 23;
+    for (int64_t k = 0; k < n; k++) {
+        const double *p = xyz + 3 * k;
+        double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
+        double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
+        for (int axis = 0; axis < 2; axis++) {
+            double *to = out + (2 * k + axis) * width, j[3], cam[3];
+            for (int i = 0; i < 3; i++) j[i] = jacobian[(3 * axis + i) * total + source[k]];
+            for (int i = 0; i < 3; i++) cam[i] = inverse[i] * j[0] + inverse[3 + i] * j[1] + inverse[6 + i] * j[2];
+            to[0] = cam[2] * y - cam[1] * z, to[1] = cam[0] * z - cam[2] * x, to[2] = cam[1] * x - cam[0] * y;
+            to[3] = j[0], to[4] = j[1], to[5] = j[2];
+            for (int64_t c = 0; c < num_own; c++) {
+                if (own[c] >= 3) to[6 + c] = extra[(2 * (own[c] - 3) + axis) * all + source[k] - first];
+                else if (own[c] == 0 || own[c] == axis + 1) to[6 + c] = (predicted[2 * k + axis] - centre[axis]) / focal[axis];
+                else to[6 + c] = 0.0;
+            }
+            for (int64_t c = 6 + num_own; c < width; c++) to[c] = 0.0;
+        }
+    }
+    return DONE;
+}
