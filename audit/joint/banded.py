@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.linalg import blas, lapack, qr
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from sfm_audit.audit.kernels.joint import near_entries
+from sfm_audit.audit.kernels.joint_parts import near_entries
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
@@ -130,12 +130,14 @@ def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> Ban
 class BandedInverse:
     """S^+ = D^-1 P X P D^-1, of which the blocks near the diagonal are at hand.
 
-    near: per block i, the entries of X at its rows and at the columns of the blocks i .. i + 3.
+    near: per block i, the entries of X at its rows and at the columns of the blocks i .. i + 3; views of ``flat``,
+    where one follows the other.
     pull: (D, g) H = X G - G (G^T X G) / 2, so that P X P = X - G H^T - H G^T; by place.
     inverse_scale: (D,) 1 / D, zero for dead columns; as in the matrix.
     """
 
     factor: BandedFactor
+    flat: FloatArray
     near: list[FloatArray]
     pull: FloatArray
     inverse_scale: FloatArray
@@ -164,7 +166,7 @@ class BandedInverse:
             return self.times(columns, right)[columns]
         place = self.factor.band.place[columns]
         order = np.argsort(place, kind="stable")
-        entries = near_entries(place[order], self.factor.band.width, self.near)
+        entries = near_entries(place[order], self.factor.band.width, self.flat, *_places_in_flat(self.near))
         if entries is None:
             return np.asarray(self.block(columns) @ right)
         scale, null, pull = self.inverse_scale[columns][:, None], self.factor.null[place], self.pull[place]
@@ -201,6 +203,12 @@ class BandedInverse:
         return out[np.ix_(back, back)] * scale * scale[:, None]
 
 
+def _places_in_flat(near: list[FloatArray]) -> tuple[IntArray, IntArray]:
+    """(b + 1,) where each block begins, and (b,) how many columns it has."""
+    sizes = np.array([block.size for block in near], dtype=np.int64)
+    return np.concatenate([[0], np.cumsum(sizes)]), np.array([block.shape[1] for block in near], dtype=np.int64)
+
+
 def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInverse:
     """Return S^+ in the units of the matrix.
 
@@ -209,18 +217,21 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     From the last block to the first, with U_i = C_i L_i^-1: X_(i, j) = -U_i^T X_(i+1, j) for j > i, and
     X_(i, i) = (L_i L_i^T)^-1 - X_(i, i+1) U_i.
     """
-    near: list[FloatArray] = []
-    width = factor.band.width
+    width, size = factor.band.width, len(factor.band.order)
+    shapes = [(own.stop - own.start, min((_REACH + 1) * width, size - own.start)) for own in factor.band.blocks()]
+    ends = np.cumsum([rows * columns for rows, columns in shapes])
+    flat = np.empty(int(ends[-1]))
+    near = [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
     for i in range(len(factor.diagonal) - 1, -1, -1):
         own, _ = lapack.dpotri(factor.diagonal[i], lower=1)
         own = np.tril(own) + np.tril(own, -1).T
-        if not near:
-            near.append(own)
+        if i + 1 == len(near):
+            near[i][...] = own
             continue
         u = _triangular(factor.diagonal[i], factor.below[i].T, transposed=True).T
-        beside = -u.T @ near[-1][:, : _REACH * width]
+        beside = -u.T @ near[i + 1][:, : _REACH * width]
         own -= beside[:, : len(u)] @ u
-        near.append(np.hstack([0.5 * (own + own.T), beside]))
+        near[i][:, : len(own)], near[i][:, len(own) :] = 0.5 * (own + own.T), beside
     null = factor.null
     pulled = factor.solve_in_order(null)
-    return BandedInverse(factor, near[::-1], pulled - 0.5 * null @ (null.T @ pulled), inverse_scale)
+    return BandedInverse(factor, flat, near, pulled - 0.5 * null @ (null.T @ pulled), inverse_scale)

@@ -11,7 +11,7 @@ from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout
 from sfm_audit.audit.kernels import kernels_in_use
-from sfm_audit.audit.kernels.joint import DesignInputs, fill_design
+from sfm_audit.audit.kernels.joint_parts import DesignInputs, fill_design
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -114,7 +114,7 @@ def _fill(
 def _inputs(
     model: SparseModel, residuals: ModelResiduals, layout: Layout, image_idx: int, source: IntArray
 ) -> DesignInputs | None:
-    """What the compiled design is made of; None where it is not to be used: panoramas have columns that are not finite."""
+    """What the compiled design is made of; None for numpy: panoramas have columns that are not finite."""
     image = model.image(image_idx)
     camera = image.camera
     if not kernels_in_use() or camera is None or camera.model.is_spherical:

@@ -45,9 +45,7 @@ def group_root(scores: CandidateScores, own: slice) -> FloatArray:
     return np.asarray((vectors[:, kept] / np.sqrt(values[kept])).T * scale)
 
 
-def test_group(
-    scores: CandidateScores, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float
-) -> GroupTest:
+def test_group(scores: CandidateScores, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float) -> GroupTest:
     """Test one group of an image's candidate fields.
 
     Parameters

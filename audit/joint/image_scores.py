@@ -1,8 +1,8 @@
 """`candidate_scores` of one image through the compiled sums.
 
 All candidate fields of an image are made of fewer functions than there are fields: scalars along x and the same along y
-(the principal point, the affine and the smooth fields), and some with both components. The sums are those of these 44; the
-fields' follow by a small matrix.
+(the principal point, the affine and the smooth fields), and some with both components. The sums are those of these 44;
+the fields' follow by a small matrix.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sfm_audit.audit.cameras.projection import is_fisheye
 from sfm_audit.audit.joint.candidates import CandidateScores
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.joint.system import Base, JointSystem
-from sfm_audit.audit.kernels.joint import DENSE, FIELDS, SCALAR, FirstHalf, JointSums
+from sfm_audit.audit.kernels.joint import FIELDS, SCALAR, FirstHalf, JointSums
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -34,7 +34,9 @@ def sums_of_base(base: Base) -> JointSums | None:
     return joint_sums(base.observations, base.left_px, weights, inverses, included)
 
 
-def image_scores(system: JointSystem, base: Base, sums: JointSums, image_idx: int, power: int) -> CandidateScores | None:
+def image_scores(
+    system: JointSystem, base: Base, sums: JointSums, image_idx: int, power: int
+) -> CandidateScores | None:
     """Return the scores of an image's candidate fields; None where the numpy path has to be taken.
 
     Parameters
@@ -59,7 +61,7 @@ def image_scores(system: JointSystem, base: Base, sums: JointSums, image_idx: in
     right = placed.collected(half.right)
     solution = base.inverse.within(placed.support, right)
     sums.second(half, tracks, placed.spread(solution))
-    made_of = _fields(camera, np.linalg.pinv(image.rotation_cam_from_world), power)
+    made_of = _fields(camera, np.asarray(np.linalg.pinv(image.rotation_cam_from_world), dtype=np.float64), power)
     gram = half.gram - right.T @ solution
     with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
         meat = half.track_score.T @ half.track_score
@@ -158,8 +160,7 @@ class _Placed:
         starts = np.cumsum(sizes) - sizes
         behind = starts[self._is_extra] + self._width
         return starts, [
-            slice(start, start + columns.size)
-            for start, columns in zip(behind.tolist(), self._extra, strict=True)
+            slice(start, start + columns.size) for start, columns in zip(behind.tolist(), self._extra, strict=True)
         ]
 
     def collected(self, right: FloatArray) -> FloatArray:

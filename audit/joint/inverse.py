@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from sfm_audit.audit.joint.banded import Band, BandedFactor, band_of, banded_factor, banded_inverse
-from sfm_audit.audit.kernels.joint import dense_entries
+from sfm_audit.audit.kernels.joint_parts import dense_entries
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal

@@ -12,7 +12,8 @@ from sfm_audit.audit.joint.design import AT_ONCE
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.audit.joint.sums import joint_sums
-from sfm_audit.audit.kernels.joint import JointSums, unit_determinants
+from sfm_audit.audit.kernels.joint import JointSums
+from sfm_audit.audit.kernels.joint_parts import unit_determinants
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
@@ -79,8 +80,9 @@ def _compiled_systems(
     for k, inverse in enumerate(inverses):
         gram = own_transform.transpose(0, 2, 1) @ np.stack([each.grams[k] for each in found]) @ own_transform
         score = np.einsum("iab,ia->ib", own_transform, np.stack([each.rights[k] for each in found]))
-        right = np.bincount(own_columns.ravel(), score.ravel(), layout.num_columns + 1)
-        before = np.bincount(own_columns.ravel(), np.einsum("iaa->ia", gram).ravel(), layout.num_columns + 1)
+        right, before = np.zeros((2, layout.num_columns + 1))
+        np.add.at(right, own_columns, score)
+        np.add.at(before, own_columns, np.einsum("iaa->ia", gram))
         slabs = np.concatenate([each.slabs[k] for each in found])
         slabs = observations.transform[around].transpose(0, 2, 1) @ slabs @ own_transform[pairs]
         first = np.flatnonzero(np.diff(pairs, prepend=-1))

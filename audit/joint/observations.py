@@ -11,7 +11,7 @@ from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY, PART, POINT, Design, make_design
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
-from sfm_audit.audit.kernels import joint as kernels
+from sfm_audit.audit.kernels import joint_parts as kernels
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 

@@ -1,7 +1,7 @@
-"""`candidate_scores` of a principal point that most images of a model share, through whole passes over the observations.
+"""`candidate_scores` of a principal point that most images of a model share, by passes over all observations.
 
-A field of all images meets every column of the base, so that what is cheap image by image (`image_scores`) is not here; but
-it has two columns only, and each is a few passes.
+A field of all images meets every column of the base, so that what is cheap image by image (`image_scores`) is not here;
+but it has two columns only, and each is a few passes.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def _collected(base: Base, sums: JointSums, values_px: FloatArray) -> FloatArray
     """(D,) N^T w values."""
     observations, layout = base.observations, base.observations.layout
     along = np.einsum("iab,ia->ib", observations.transform, sums.along_design(values_px))
-    return np.bincount(layout.columns.ravel(), along.ravel(), layout.num_columns + 1)[:-1]
+    out = np.zeros(layout.num_columns + 1)
+    np.add.at(out, layout.columns, along)
+    return out[:-1]
 
 
 def _by_point(base: Base, sums: JointSums, field_px: FloatArray, solution: FloatArray) -> FloatArray:
@@ -70,4 +72,4 @@ def _by_point(base: Base, sums: JointSums, field_px: FloatArray, solution: Float
     left = field_px.copy()
     sums.subtract_step(moved_by(observations, solution), left)
     product = observations.weight * (base.left_px * left).sum(axis=1)
-    return np.bincount(observations.point_idx, product, observations.num_points)
+    return np.asarray(np.bincount(observations.point_idx, product, observations.num_points), dtype=np.float64)

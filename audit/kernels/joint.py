@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sfm_audit.audit.kernels.checked import SmallIntArray, doubles, ints, small_ints
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel, library
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-
-SmallIntArray: TypeAlias = NDArray[np.int32]
 
 SCALAR: Final = 16
 """Scalar functions of a field along one axis: 1, the fourteen monomials, padding."""
@@ -47,7 +45,8 @@ class FirstHalf(NamedTuple):
     """What `JointSums.first` says of an image; F = 44 fields.
 
     around: (m,) images that see its points, ascending.    right: (rows, F) by image around: columns of the design, then
-    its included fields.    gram: (F, F).    plain: (16, 16) and dense_plain: (12, 12): w E^T E of scalars and of dense fields.
+    its included fields.    gram: (F, F).
+    plain: (16, 16) and dense_plain: (12, 12): w E^T E of scalars and of dense fields.
     score: (F,).    track_score: (T, F).    views: what `JointSums.second` needs.
     """
 
@@ -64,8 +63,8 @@ class FirstHalf(NamedTuple):
 class NormalOfImage(NamedTuple):
     """What an image adds to the normal equations.
 
-    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows) and
-    the image (columns), its own one halved.    grams: (2, C, C).    rights: (2, C). All without T.
+    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows)
+    and the image (columns), its own one halved.    grams: (2, C, C).    rights: (2, C). All without T.
     """
 
     around: IntArray
@@ -109,17 +108,17 @@ class JointSums:
         extra = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(1)
         last = len(arrays.weights) - 1
         held: dict[str, Any] = {
-            "offsets": _ints(arrays.offsets, num_images + 1),
-            "image_idx": _small_ints(arrays.image_idx, num_rows),
-            "point_idx": _small_ints(arrays.point_idx, num_rows),
-            "by_point": _small_ints(arrays.by_point, num_rows),
-            "point_offsets": _ints(arrays.point_offsets, num_points + 1),
-            "design": _doubles(arrays.design, (num_rows, 2, arrays.design.shape[2])),
-            "weight": _doubles(arrays.weights[0], (num_rows,)),
-            "other_weight": _doubles(arrays.weights[last], (num_rows,)),
-            "left": _doubles(arrays.left_px, (num_rows, 2)),
-            "point_inverse": _doubles(arrays.inverses[0], (num_points, 3, 3)),
-            "other_inverse": _doubles(arrays.inverses[last], (num_points, 3, 3)),
+            "offsets": ints(arrays.offsets, num_images + 1),
+            "image_idx": small_ints(arrays.image_idx, num_rows),
+            "point_idx": small_ints(arrays.point_idx, num_rows),
+            "by_point": small_ints(arrays.by_point, num_rows),
+            "point_offsets": ints(arrays.point_offsets, num_points + 1),
+            "design": doubles(arrays.design, (num_rows, 2, arrays.design.shape[2])),
+            "weight": doubles(arrays.weights[0], (num_rows,)),
+            "other_weight": doubles(arrays.weights[last], (num_rows,)),
+            "left": doubles(arrays.left_px, (num_rows, 2)),
+            "point_inverse": doubles(arrays.inverses[0], (num_points, 3, 3)),
+            "other_inverse": doubles(arrays.inverses[last], (num_points, 3, 3)),
             "extra_first": first,
             "extra_width": width,
             "extra": extra,
@@ -130,6 +129,7 @@ class JointSums:
         self._widths = arrays.design.shape[2] + width
         self.width = int(arrays.design.shape[2])
         self._model = _Model(num_images, self.width, *(held[name].ctypes.data for name in _ARRAYS))
+        self._model.held = held  # whoever keeps the addresses keeps the arrays
         self._place = np.zeros(num_images, dtype=np.int64)
         views = np.diff(held["point_offsets"])[held["point_idx"]]
         self._is_first = _first_views(held)
@@ -140,7 +140,7 @@ class JointSums:
         return bool(self._num_views[image_idx] <= _MOST_VIEWS)
 
     def tracks(self, image_idx: int) -> tuple[SmallIntArray, int]:
-        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too, and their number."""
+        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too; their number."""
         rows = slice(*self._held["offsets"][image_idx : image_idx + 2].tolist())
         is_first = self._is_first[rows]
         if is_first.all():
@@ -153,7 +153,14 @@ class JointSums:
         return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
 
     def fields(
-        self, image_idx: int, facts: FloatArray, xyz_world: FloatArray, xy_px: FloatArray, *, is_fisheye: bool, power: int
+        self,
+        image_idx: int,
+        facts: FloatArray,
+        xyz_world: FloatArray,
+        xy_px: FloatArray,
+        *,
+        is_fisheye: bool,
+        power: int,
     ) -> tuple[FloatArray, FloatArray] | None:
         """Return the fields (n_i, 16) and (n_i, 2, 12) of an image; None where one of its points does not project.
 
@@ -178,7 +185,21 @@ class JointSums:
         """First half of `candidate_scores`: what an image's fields are to the base, before S^+."""
         function = kernel(
             "joint_first",
-            *(_ModelPointer, Ints, Size, Doubles, Doubles, SmallInts, Size, Size, SmallInts, SmallInts, Ints, Ints, Ints),
+            *(
+                _ModelPointer,
+                Ints,
+                Size,
+                Doubles,
+                Doubles,
+                SmallInts,
+                Size,
+                Size,
+                SmallInts,
+                SmallInts,
+                Ints,
+                Ints,
+                Ints,
+            ),
             *([Doubles] * 8),
             Size,
         )
@@ -205,9 +226,7 @@ class JointSums:
             return None
         count, rows = num.tolist()
         around, start = around[:count], start[: count + 1]
-        return FirstHalf(
-            around, right[:rows], gram, plain, dense_plain, score, track_score, (own, start, scores)
-        )
+        return FirstHalf(around, right[:rows], gram, plain, dense_plain, score, track_score, (own, start, scores))
 
     def second(self, first: FirstHalf, tracks: tuple[SmallIntArray, int], moved: FloatArray) -> None:
         """Second half: subtract from ``first.track_score`` what the base does, ``moved`` (rows, F) = T B, in place."""
@@ -242,10 +261,8 @@ class JointSums:
         return NormalOfImage(around[:count], np.stack([slab[:count], other[:count]]), grams, rights)
 
     def meat(self, image_idx: int) -> tuple[IntArray, FloatArray] | None:
-        """(m,) the image and those behind it that see its points, and (m, C, C) sums of scores times its own, without T."""
-        function = kernel(
-            "joint_meat", _ModelPointer, Ints, Size, Size, SmallInts, Size, Ints, Ints, Doubles
-        )
+        """(m,) the image and those behind it that see its points; (m, C, C) scores times its own, summed, without T."""
+        function = kernel("joint_meat", _ModelPointer, Ints, Size, Size, SmallInts, Size, Ints, Ints, Doubles)
         if function is None:
             return None
         views = int(self._num_views[image_idx])
@@ -258,11 +275,11 @@ class JointSums:
         )
         return (around[: int(num[0])], slab[: int(num[0])]) if status == DONE else None
 
-    def off_points(self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True) -> tuple[FloatArray, FloatArray]:
+    def off_points(
+        self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
         """Return (P, 3) V^-1 J^T w values, and (n, 2) the values minus what that removes, of one of the systems."""
-        function = kernel(
-            "joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size
-        )
+        function = kernel("joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size)
         if function is None or values_px.shape != self._held["left"].shape:
             raise ValueError("values of other observations, or no kernels")
         weight, inverse = (
@@ -278,7 +295,11 @@ class JointSums:
     def subtract_step(self, moved: FloatArray, left_px: FloatArray) -> None:
         """Subtract design times ``moved`` (I, C), T step of each image, from ``left_px`` (n, 2), in place."""
         function = kernel("joint_subtract_step", _ModelPointer, Doubles, Doubles)
-        if function is None or left_px.shape != self._held["left"].shape or moved.shape != (len(self._place), self.width):
+        if (
+            function is None
+            or left_px.shape != self._held["left"].shape
+            or moved.shape != (len(self._place), self.width)
+        ):
             raise ValueError("steps of other images, or no kernels")
         function(ctypes.byref(self._model), moved, left_px)
 
@@ -296,113 +317,6 @@ class JointSums:
         return int(last - first)
 
 
-class DesignInputs(NamedTuple):
-    """What the design of an image is made of.
-
-    facts: (25,) R, its inverse, t, fx, fy, cx, cy.    own: (k,) of each own parameter, 0 focal length of both axes, 1 of x,
-    2 of y, 3 + e distortion parameter e.    jacobian: (2, 3, N) in the points of all inliers of the model.
-    source: (n,) columns of it.    first: column of the image's first inlier.
-    xyz_world: (n, 3).    xy_px: (n, 2) predicted.    d_extra: (e, 2, m) of the image's m inliers.
-    """
-
-    facts: FloatArray
-    own: IntArray
-    jacobian: FloatArray
-    source: IntArray
-    first: int
-    xyz_world: FloatArray
-    xy_px: FloatArray
-    d_extra: FloatArray
-
-
-def fill_design(out: FloatArray, given: DesignInputs) -> bool:
-    """Write the design (n, 2, C) of an image; False for the numpy path."""
-    function = kernel(
-        "joint_design",
-        *([Size] * 5),
-        *(Doubles, Ints, Doubles, Ints, Size, Doubles, Doubles, Doubles, Doubles),
-    )
-    n, width, num_all = len(out), out.shape[2], given.d_extra.shape[2]
-    local = given.source - given.first
-    is_sound = (
-        given.jacobian.flags.c_contiguous
-        and given.xyz_world.shape == (n, 3)
-        and given.xy_px.shape == (n, 2)
-        and given.source.shape == (n,)
-        and given.facts.shape == (25,)
-        and 6 + given.own.size <= width
-        and (not n or (local.min() >= 0 and given.source.max() < given.jacobian.shape[2]))
-        and (not given.own.size or (given.own.min() >= 0 and given.own.max() < 3 + len(given.d_extra)))
-        and (not (given.own >= 3).any() or not n or local.max() < num_all)
-    )
-    if function is None or not is_sound:
-        return False
-    function(
-        *(n, width, given.jacobian.shape[2], num_all, given.own.size, given.facts, given.own, given.jacobian),
-        *(given.source, given.first, given.xyz_world, np.ascontiguousarray(given.xy_px)),
-        *(np.ascontiguousarray(given.d_extra), out),
-    )
-    return True
-
-
-def point_information(
-    jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int
-) -> FloatArray | None:
-    """V (P, 3, 3): sum of w J^T J over a point's views, of J (2, 3, n); None for the numpy path."""
-    function = kernel("joint_information", Size, Size, Doubles, Doubles, SmallInts, Doubles)
-    n = weight.size
-    if function is None or jacobian.shape != (2, 3, n) or not jacobian.flags.c_contiguous:
-        return None
-    index = _small_ints(point_idx, n)
-    if n and not (0 <= int(index.min()) and int(index.max()) < num_points):
-        return None
-    out = np.empty((num_points, 3, 3))
-    function(n, num_points, jacobian, np.ascontiguousarray(weight), index, out)
-    return out
-
-
-def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) -> FloatArray | None:
-    """(P,) determinants of (P, 3, 3) scaled to unit diagonal; inverts them in place where asked to. None: numpy path.
-
-    Parameters
-    ----------
-    smallest : squares of the scale below it count as it
-    """
-    function = kernel("joint_invert", Size, Doubles, Doubles, ctypes.c_double, Size)
-    if function is None:
-        return None
-    out = np.empty(len(matrices))
-    function(len(matrices), matrices, out, smallest, int(invert))
-    return out
-
-
-def near_entries(place: IntArray, width: int, near: list[FloatArray]) -> FloatArray | None:
-    """(s, s) entries at sorted places of a banded symmetric matrix; None where not all are at hand, or without kernels.
-
-    Parameters
-    ----------
-    near : per block of ``width`` rows, its entries at the columns of the block and of those behind it
-    """
-    function = kernel("joint_near_entries", Size, Ints, Size, Ints, Ints, Size, Doubles)
-    if function is None or not all(block.flags.c_contiguous for block in near):
-        return None
-    addresses = np.array([block.ctypes.data for block in near], dtype=np.int64)
-    columns = np.array([block.shape[1] for block in near], dtype=np.int64)
-    out = np.empty((place.size, place.size))
-    return out if function(place.size, place, width, addresses, columns, len(near), out) == DONE else None
-
-
-def dense_entries(matrix: FloatArray, columns: IntArray) -> FloatArray | None:
-    """(s, s) entries of a symmetric matrix (D, D), in C or Fortran order, at some columns; None for the numpy path."""
-    function = kernel("joint_dense_entries", Size, Ints, Size, Doubles, Doubles)
-    in_order = matrix if matrix.flags.c_contiguous else matrix.T
-    if function is None or not in_order.flags.c_contiguous:
-        return None
-    out = np.empty((columns.size, columns.size))
-    status = function(columns.size, np.ascontiguousarray(columns, dtype=np.int64), len(matrix), in_order, out)
-    return out if status == DONE else None
-
-
 def has_joint_kernels() -> bool:
     """Whether the sums come from the compiled library."""
     return library() is not None
@@ -416,32 +330,6 @@ def _first_views(held: dict[str, Any]) -> BoolArray:
     again[1:] = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
     out = np.ones(by_point.size, dtype=bool)
     out[by_point[again]] = False
-    return out
-
-
-def _ints(values: IntArray, size: int) -> IntArray:
-    out = np.ascontiguousarray(values, dtype=np.int64)
-    if out.shape != (size,):
-        raise ValueError(f"expected {size} indices, found shape {out.shape}")
-    return out
-
-
-def _small_ints(values: IntArray, size: int) -> SmallIntArray:
-    """C follows them without looking: the conversion must lose nothing."""
-    if size >= 2**31:
-        raise ValueError(f"expected fewer than 2^31 observations, found {size}")
-    if values.dtype != np.int32 and values.size and not (-(2**31) <= int(values.min()) and int(values.max()) < 2**31):
-        raise ValueError("indices do not fit 32 bits")
-    out = np.ascontiguousarray(values, dtype=np.int32)
-    if out.shape != (size,):
-        raise ValueError(f"expected {size} indices, found shape {out.shape}")
-    return out
-
-
-def _doubles(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    out = np.ascontiguousarray(values, dtype=np.float64)
-    if out.shape != shape:
-        raise ValueError(f"expected an array of shape {shape}, found {out.shape}")
     return out
 
 

@@ -25,14 +25,8 @@ from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.shift_scores import shift_scores
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.joint import (
-    JointArrays,
-    JointSums,
-    dense_entries,
-    near_entries,
-    point_information,
-    unit_determinants,
-)
+from sfm_audit.audit.kernels.joint import JointArrays, JointSums
+from sfm_audit.audit.kernels.joint_parts import dense_entries, near_entries, point_information, unit_determinants
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
 from sfm_audit.audit.table.words import MisfitGroup
 
@@ -67,7 +61,13 @@ def both(request):
     spec = dataclasses.replace(SPEC, shared_camera=True) if name == "shared" else SPEC
     spec = dataclasses.replace(spec, camera_model=name) if name in KINDS else spec
     model = model_of(spec, seed=3)
-    model = with_rig(model_of(dataclasses.replace(SPEC, num_images=8), seed=3)) if name == "rig" else seen_twice(model) if name == "twice" else model
+    model = (
+        with_rig(model_of(dataclasses.replace(SPEC, num_images=8), seed=3))
+        if name == "rig"
+        else seen_twice(model)
+        if name == "twice"
+        else model
+    )
     auditor = ModelAuditor(model)
     given = model, auditor.residuals, auditor.sigma_constant_px
     options = {}
@@ -308,11 +308,20 @@ def test_entries_of_a_band_and_of_a_matrix():
     rng = np.random.default_rng(2)
     full = rng.normal(size=(10, 10))
     full = full + full.T
-    blocks = [full[0:4, 0:10].copy(), full[4:8, 4:10].copy(), full[8:10, 8:10].copy()]
+    blocks = [full[0:4, 0:10], full[4:8, 4:10], full[8:10, 8:10]]
     place = np.array([1, 2, 5, 9])
-    np.testing.assert_array_equal(near_entries(place, 4, blocks), full[np.ix_(place, place)])
-    short = [blocks[0][:, :8].copy(), *blocks[1:]]
-    assert near_entries(place, 4, short) is None
+
+    def entries(blocks, at=place):
+        starts = np.cumsum([0, *(block.size for block in blocks)])
+        columns = np.array([block.shape[1] for block in blocks])
+        return near_entries(at, 4, np.concatenate([block.ravel() for block in blocks]), starts, columns)
+
+    np.testing.assert_array_equal(entries(blocks), full[np.ix_(place, place)])
+    assert entries([blocks[0][:, :8], *blocks[1:]]) is None
+    assert entries(blocks[:2]) is None
+    assert entries(blocks, np.array([8, 11])) is None
+    with pytest.raises(ValueError, match="another band"):
+        near_entries(place, 4, np.zeros(3), np.array([0, 4]), np.array([2]))
     np.testing.assert_array_equal(dense_entries(full, place[::-1].copy()), full[np.ix_(place[::-1], place[::-1])])
     assert dense_entries(full, np.array([0, 10])) is None
     assert dense_entries(full[:, ::2], np.array([0])) is None

@@ -522,47 +522,6 @@ WIDE KERNEL int64_t joint_meat(
     return status;
 }
 
-/* V (P, 3, 3): sum of w J^T J over a point's views; jacobian (2, 3, n) and weight (n) are of all observations. Where the
- * weight is zero nothing is added, whatever the derivatives. */
-KERNEL int64_t joint_information(
-    int64_t n, int64_t num_points, const double *jacobian, const double *weight, const int32_t *point_idx, double *out) {
-    memset(out, 0, (size_t)(9 * num_points) * sizeof *out);
-    for (int64_t k = 0; k < n; k++) {
-        double w = weight[k], *v = out + 9 * point_idx[k];
-        if (w == 0.0) continue;
-        double x[3], y[3];
-        for (int i = 0; i < 3; i++) x[i] = jacobian[i * n + k], y[i] = jacobian[(3 + i) * n + k];
-        for (int i = 0; i < 3; i++) {
-            for (int j = i; j < 3; j++) v[3 * i + j] += w * (x[i] * x[j] + y[i] * y[j]);
-        }
-    }
-    for (int64_t p = 0; p < num_points; p++) {
-        double *v = out + 9 * p;
-        v[3] = v[1], v[6] = v[2], v[7] = v[5];
-    }
-    return DONE;
-}
-
-/* Determinants (P) of the matrices (P, 3, 3) scaled to unit diagonal; with invert their inverses in place, too: zero stays
- * zero. smallest: squares below it count as it. */
-KERNEL int64_t joint_invert(int64_t num_points, double *matrices, double *determinant, double smallest, int64_t invert) {
-    for (int64_t p = 0; p < num_points; p++) {
-        double *v = matrices + 9 * p, s[3];
-        for (int i = 0; i < 3; i++) s[i] = sqrt(v[4 * i] > smallest ? v[4 * i] : smallest);
-        double a = v[0] / s[0] / s[0], b = v[1] / s[0] / s[1], c = v[2] / s[0] / s[2];
-        double d = v[4] / s[1] / s[1], e = v[5] / s[1] / s[2], f = v[8] / s[2] / s[2];
-        double co00 = d * f - e * e, co01 = c * e - b * f, co02 = b * e - c * d;
-        double det = a * co00 + b * co01 + c * co02;
-        determinant[p] = det;
-        if (!invert || (v[0] == 0.0 && v[4] == 0.0 && v[8] == 0.0)) continue;
-        double co11 = a * f - c * c, co12 = b * c - a * e, co22 = a * d - b * b, scale = 1.0 / det;
-        v[0] = co00 * scale / s[0] / s[0], v[1] = v[3] = co01 * scale / s[0] / s[1];
-        v[2] = v[6] = co02 * scale / s[0] / s[2], v[4] = co11 * scale / s[1] / s[1];
-        v[5] = v[7] = co12 * scale / s[1] / s[2], v[8] = co22 * scale / s[2] / s[2];
-    }
-    return DONE;
-}
-
 /* steps (P, 3): V^-1 J^T w values (n, 2); cleaned (n, 2): values minus J steps, where asked for (not NULL). */
 KERNEL int64_t joint_off_points(
     const joint_model *m, const double *weight, const double *inverse, int64_t num_points, const double *values,
@@ -646,71 +605,6 @@ WIDE KERNEL int64_t joint_fields(
         d[2] = fx * cross, e[2] = fy * (r2 + 2.0 * v * v), d[3] = fx * (r2 + 2.0 * u * u), e[3] = fy * cross;
         for (int c = 0; c < 6; c++) d[4 + c] = dx[c] * along, e[4 + c] = dy[c] * along;
         d[10] = sx * next, e[10] = sy * next, d[11] = 0.0, e[11] = 0.0;
-    }
-    return DONE;
-}
-
-/* out (s, s): entries of a banded symmetric matrix at sorted places (s), from the rows of its blocks.
- *
- * near: address of each block's rows (width of the block, columns of it and of those behind it), columns: of each. */
-KERNEL int64_t joint_near_entries(
-    int64_t size, const int64_t *place, int64_t width, const int64_t *near, const int64_t *columns, int64_t num_blocks,
-    double *out) {
-    for (int64_t i = 0; i < size; i++) {
-        int64_t block = place[i] / width, origin = block * width;
-        if (place[i] < 0 || block >= num_blocks || place[size - 1] - origin >= columns[block]) return NEEDS_NUMPY;
-        const double *row = (const double *)(intptr_t)near[block] + (place[i] - origin) * columns[block];
-        for (int64_t j = i; j < size; j++) out[i * size + j] = row[place[j] - origin];
-    }
-    for (int64_t i = 0; i < size; i += ROWS) { /* the other half, in tiles */
-        for (int64_t j = 0; j < i + ROWS && j < size; j++) {
-            for (int64_t k = i; k < i + ROWS && k < size; k++) {
-                if (k > j) out[k * size + j] = out[j * size + k];
-            }
-        }
-    }
-    return DONE;
-}
-
-/* out (s, s): entries of a symmetric matrix (size, size) at some columns (s). */
-KERNEL int64_t joint_dense_entries(int64_t num, const int64_t *columns, int64_t size, const double *matrix, double *out) {
-    for (int64_t i = 0; i < num; i++) {
-        if (columns[i] < 0 || columns[i] >= size) return NEEDS_NUMPY;
-    }
-    for (int64_t i = 0; i < num; i++) {
-        const double *row = matrix + columns[i] * size;
-        for (int64_t j = 0; j < num; j++) out[i * num + j] = row[columns[j]];
-    }
-    return DONE;
-}
-
-/* The design (n, 2, width) of one image: derivatives in the rotation, in the points, in the own parameters; zero padding.
- *
- * facts: R (9), its inverse (9), t (3), fx, fy, cx, cy.    own (num_own): 0 focal length of both axes, 1 of x, 2 of y, 3 + e
- * distortion parameter e.    jacobian (2, 3, total), source (n): its columns.    xyz (n, 3) world, predicted (n, 2) px.
- * extra (num_extra, 2, all): of all the image's inliers, which (n) among them. */
-KERNEL int64_t joint_design(
-    int64_t n, int64_t width, int64_t total, int64_t all, int64_t num_own, const double *facts, const int64_t *own,
-    const double *jacobian, const int64_t *source, int64_t first, const double *xyz, const double *predicted,
-    const double *extra, double *out) {
-    const double *r = facts, *inverse = facts + 9, *t = facts + 18, *focal = facts + 21, *centre = facts + 23;
-    for (int64_t k = 0; k < n; k++) {
-        const double *p = xyz + 3 * k;
-        double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
-        double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
-        for (int axis = 0; axis < 2; axis++) {
-            double *to = out + (2 * k + axis) * width, j[3], cam[3];
-            for (int i = 0; i < 3; i++) j[i] = jacobian[(3 * axis + i) * total + source[k]];
-            for (int i = 0; i < 3; i++) cam[i] = inverse[i] * j[0] + inverse[3 + i] * j[1] + inverse[6 + i] * j[2];
-            to[0] = cam[2] * y - cam[1] * z, to[1] = cam[0] * z - cam[2] * x, to[2] = cam[1] * x - cam[0] * y;
-            to[3] = j[0], to[4] = j[1], to[5] = j[2];
-            for (int64_t c = 0; c < num_own; c++) {
-                if (own[c] >= 3) to[6 + c] = extra[(2 * (own[c] - 3) + axis) * all + source[k] - first];
-                else if (own[c] == 0 || own[c] == axis + 1) to[6 + c] = (predicted[2 * k + axis] - centre[axis]) / focal[axis];
-                else to[6 + c] = 0.0;
-            }
-            for (int64_t c = 6 + num_own; c < width; c++) to[c] = 0.0;
-        }
     }
     return DONE;
 }

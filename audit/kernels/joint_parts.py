@@ -1,0 +1,126 @@
+"""What the joint system is made of: derivatives, the information on points, entries of an inverse (`joint_parts.c`)."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from sfm_audit.audit.kernels.checked import small_ints
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+
+_DONE: Final = 0
+
+
+class DesignInputs(NamedTuple):
+    """What the design of an image is made of.
+
+    facts: (25,) R, its inverse, t, fx, fy, cx, cy.
+    own: (k,) of each own parameter: 0 focal length of both axes, 1 of x, 2 of y, 3 + e distortion parameter e.
+    jacobian: (2, 3, N) in the points of all inliers of the model.
+    source: (n,) columns of it.    first: column of the image's first inlier.
+    xyz_world: (n, 3).    xy_px: (n, 2) predicted.    d_extra: (e, 2, m) of the image's m inliers.
+    """
+
+    facts: FloatArray
+    own: IntArray
+    jacobian: FloatArray
+    source: IntArray
+    first: int
+    xyz_world: FloatArray
+    xy_px: FloatArray
+    d_extra: FloatArray
+
+
+def fill_design(out: FloatArray, given: DesignInputs) -> bool:
+    """Write the design (n, 2, C) of an image; False for the numpy path."""
+    function = kernel(
+        "joint_design",
+        *([Size] * 5),
+        *(Doubles, Ints, Doubles, Ints, Size, Doubles, Doubles, Doubles, Doubles),
+    )
+    n, width, num_all = len(out), out.shape[2], given.d_extra.shape[2]
+    local = given.source - given.first
+    is_sound = (
+        given.jacobian.flags.c_contiguous
+        and given.xyz_world.shape == (n, 3)
+        and given.xy_px.shape == (n, 2)
+        and given.source.shape == (n,)
+        and given.facts.shape == (25,)
+        and 6 + given.own.size <= width
+        and (not n or (local.min() >= 0 and given.source.max() < given.jacobian.shape[2]))
+        and (not given.own.size or (given.own.min() >= 0 and given.own.max() < 3 + len(given.d_extra)))
+        and (not (given.own >= 3).any() or not n or local.max() < num_all)
+    )
+    if function is None or not is_sound:
+        return False
+    function(
+        *(n, width, given.jacobian.shape[2], num_all, given.own.size, given.facts, given.own, given.jacobian),
+        *(given.source, given.first, given.xyz_world, np.ascontiguousarray(given.xy_px)),
+        *(np.ascontiguousarray(given.d_extra), out),
+    )
+    return True
+
+
+def point_information(
+    jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int
+) -> FloatArray | None:
+    """V (P, 3, 3): sum of w J^T J over a point's views, of J (2, 3, n); None for the numpy path."""
+    function = kernel("joint_information", Size, Size, Doubles, Doubles, SmallInts, Doubles)
+    n = weight.size
+    if function is None or jacobian.shape != (2, 3, n) or not jacobian.flags.c_contiguous:
+        return None
+    index = small_ints(point_idx, n)
+    if n and not (int(index.min()) >= 0 and int(index.max()) < num_points):
+        return None
+    out = np.empty((num_points, 3, 3))
+    function(n, num_points, jacobian, np.ascontiguousarray(weight), index, out)
+    return out
+
+
+def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) -> FloatArray | None:
+    """(P,) determinants of (P, 3, 3) scaled to unit diagonal; inverts them in place where asked to. None: numpy path.
+
+    Parameters
+    ----------
+    smallest : squares of the scale below it count as it
+    """
+    function = kernel("joint_invert", Size, Doubles, Doubles, ctypes.c_double, Size)
+    if function is None:
+        return None
+    out = np.empty(len(matrices))
+    function(len(matrices), matrices, out, smallest, int(invert))
+    return out
+
+
+def near_entries(
+    place: IntArray, width: int, near: FloatArray, starts: IntArray, columns: IntArray
+) -> FloatArray | None:
+    """(s, s) entries at sorted places of a banded symmetric matrix; None where not all are at hand, or without kernels.
+
+    Parameters
+    ----------
+    near : (m,) of each block of ``width`` rows its entries at the columns of the block and of those behind it
+    starts, columns : (b + 1,) where each block begins in it, and (b,) how many columns it has
+    """
+    function = kernel("joint_near_entries", Size, Ints, Size, Doubles, Ints, Ints, Size, Doubles)
+    if function is None:
+        return None
+    if len(starts) != len(columns) + 1 or starts[-1] != near.size or width < 1:
+        raise ValueError("blocks of another band")
+    out = np.empty((place.size, place.size))
+    found = function(place.size, place, width, near, starts, columns, len(columns), out)
+    return out if found == _DONE else None
+
+
+def dense_entries(matrix: FloatArray, columns: IntArray) -> FloatArray | None:
+    """(s, s) entries of a symmetric matrix (D, D), in C or Fortran order, at some columns; None for the numpy path."""
+    function = kernel("joint_dense_entries", Size, Ints, Size, Doubles, Doubles)
+    in_order = matrix if matrix.flags.c_contiguous else matrix.T
+    if function is None or not in_order.flags.c_contiguous:
+        return None
+    out = np.empty((columns.size, columns.size))
+    status = function(columns.size, np.ascontiguousarray(columns, dtype=np.int64), len(matrix), in_order, out)
+    return out if status == _DONE else None
