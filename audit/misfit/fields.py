@@ -46,7 +46,7 @@ NUM_FIELDS: Final = sum(_NUM_COLUMNS.values())
 
 def follows_the_lens(model: CameraModel) -> bool:
     """Whether the candidate fields are those of the list below, without a model's own derivatives in their place."""
-    return not model.is_spherical and model.name not in _OWN_COEFFICIENTS
+    return not model.is_spherical and model.name not in OWN_COEFFICIENTS
 
 
 def candidate_fields(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
