@@ -25,7 +25,7 @@ from sfm_audit.loaders.model import SparseModel
 _POSE: Final = 6
 _MIN_OBSERVATIONS: Final = 64  # per image: of fewer the profiles of poses are more than the columns
 _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns
-_TRACKS_AT_ONCE: Final = 1 << 15  # whose scores are in memory at the same time; numpy has all
+_TRACKS_AT_ONCE: Final = 1 << 16  # whose scores are in memory at the same time; numpy has all
 
 
 def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: Sequence[int]) -> PooledTests | None:
@@ -37,7 +37,7 @@ def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: 
 
     Notes
     -----
-    Two passes over the observations. Memory: 3 kB for each image and 320 bytes for each of 32,768 tracks.
+    Two passes over the observations. Memory: 3 kB for each image and 320 bytes for each of 65,536 tracks.
     """
     source = ModelSums(model, residuals)
     num_observations = sum(source.num_of(image) for image in images)
@@ -144,12 +144,13 @@ def _meat(source: ModelSums, images: Sequence[int], first: _Pooled, solution: Po
     normal = first.normal
     basis, on_y, coefficients = _profiles(first, solution)
     at_once = _TRACKS_AT_ONCE if kernels_in_use() else normal.num_tracks
+    windows = list(source.windows(images)) if kernels_in_use() else None  # numpy's hold their features
     meat = np.zeros((NUM_FEATURES, NUM_FEATURES))
     for start in range(0, normal.num_tracks, at_once):
         tracks = Tracks(first.track_of_point, start, min(start + at_once, normal.num_tracks))
         per_track = np.zeros((tracks.last - tracks.first, NUM_FEATURES))
         at = 0
-        for window in source.windows(images):
+        for window in source.windows(images) if windows is None else windows:
             own = slice(at, at + len(window.images))
             window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
             at = own.stop

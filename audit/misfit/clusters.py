@@ -18,8 +18,13 @@ def coincident_keypoints(xy_px: FloatArray) -> IntArray | None:
     Clusters are whole numbers >= 0, (n,). Only who counts together depends on the observed points, never the fields
     that are tested.
     """
-    column, row = np.floor(xy_px).astype(np.int64).T
-    height = int(row.max(initial=0) - row.min(initial=0)) + 1
-    cell = (column - column.min(initial=0)) * height + row - row.min(initial=0)
+    cell = pixels(xy_px)
     distinct, cluster = np.unique(cell, return_inverse=True)
     return None if distinct.size == cell.size else cluster.astype(np.int64)
+
+
+def pixels(xy_px: FloatArray) -> IntArray:
+    """Return a number >= 0 of the pixel that each keypoint (n, 2) lies in, (n,)."""
+    column, row = np.floor(xy_px).astype(np.int64).T
+    height = int(row.max(initial=0) - row.min(initial=0)) + 1
+    return np.asarray((column - column.min(initial=0)) * height + row - row.min(initial=0))

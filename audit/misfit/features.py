@@ -16,7 +16,7 @@ from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.kernels.misfit import NUM_FEATURES
 from sfm_audit.audit.misfit import basis
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, OWN_COEFFICIENTS
-from sfm_audit.audit.misfit.nuisance import nuisance_columns
+from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
@@ -50,26 +50,30 @@ FIELD_OF_FEATURE: Final = np.array(
 
 
 class ImageFeatures(NamedTuple):
-    """One image: own (q, 2, n) N, residuals_px (2, n), lens (4, 2, n), shutter (6, 2, n), monomials (15, n)."""
+    """One image: rows (q + 11, 2, n), N, the residuals, lens (4) and rolling shutter (6); monomials (15, n)."""
 
-    own: FloatArray
-    residuals_px: FloatArray
-    lens: FloatArray
-    shutter: FloatArray
+    rows: FloatArray
     monomials: FloatArray
+
+    @property
+    def num_own(self) -> int:
+        """Columns of N."""
+        return len(self.rows) - 1 - SHUTTER.stop
 
 
 def image_features(camera: CameraRecord, projected: ProjectedImage, residuals_px: FloatArray) -> ImageFeatures:
     """Return the features of an image, of a camera that has fields, from what it predicts and residuals (2, n)."""
+    chosen = fitted_param_idxs(camera.model)
+    q = len(projected.pose) + len(chosen)
+    rows = np.empty((q + 1 + SHUTTER.stop, *residuals_px.shape))
+    rows[:6], rows[q] = projected.pose, residuals_px
+    for place, idx in enumerate(chosen):  # as `nuisance_columns`, without a copy of its own
+        rows[6 + place] = projected.d_params[idx]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left to `prepare`
         row = (projected.xy_px[1] - 0.5 * camera.height) / camera.height
-        return ImageFeatures(
-            nuisance_columns(camera.model, projected),
-            residuals_px,
-            _lens(camera, projected),
-            projected.pose * row,
-            _monomials(camera, projected.xy_px),
-        )
+        np.multiply(projected.pose, row, out=rows[q + 5 :])
+        _fill_lens(rows[q + 1 : q + 5], camera, projected)
+        return ImageFeatures(rows, _monomials(camera, projected.xy_px))
 
 
 def affine_offset(camera: CameraRecord) -> tuple[float, float]:
@@ -79,14 +83,13 @@ def affine_offset(camera: CameraRecord) -> tuple[float, float]:
     return (0.5 * camera.width - cx) / half, (0.5 * camera.height - cy) / half
 
 
-def _lens(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
-    """Radial and tangential columns of `candidate_fields`."""
+def _fill_lens(out: FloatArray, camera: CameraRecord, projected: ProjectedImage) -> None:
+    """Radial and tangential columns of `candidate_fields`, (4, 2, n)."""
     focals = camera.model.focal_idxs
     scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
     u = projected.u
     square = u * u
     r2 = square[0] + square[1]
-    out = np.empty((4, *u.shape))
     np.multiply(u * scale, r2 * r2, out=out[0])
     np.multiply(out[0], r2, out=out[1])
     out[3, 1] = out[2, 0] = 2.0 * u[0] * u[1]
@@ -97,7 +100,6 @@ def _lens(camera: CameraRecord, projected: ProjectedImage) -> FloatArray:
     for group, names in OWN_COEFFICIENTS.get(camera.model.name, {}).items():
         own = [camera.model.param_names.index(name) for name in names]
         out[starts[group] : starts[group] + 2] = projected.d_params[own]
-    return out
 
 
 def _monomials(camera: CameraRecord, xy_px: FloatArray) -> FloatArray:
@@ -121,9 +123,8 @@ def sums_of(features: ImageFeatures) -> tuple[FloatArray, FloatArray]:
     Used are N with all, radial and tangential ones, rolling shutter, and monomials, each among themselves; the rest is
     zero here and there.
     """
-    own, y, lens, shutter, m = features
-    q, (lens_end, shutter_end) = len(own), (len(own) + 5, len(own) + 11)
-    rows = np.concatenate([own, y[None], lens, shutter])
+    (rows, m), q = features, features.num_own
+    lens_end, shutter_end = q + 5, q + 11
     flat = rows.reshape(len(rows), -1)
     along_x, along_y = rows[: q + 1, 0] @ m.T, rows[: q + 1, 1] @ m.T
     with_own, moments = flat[: q + 1] @ flat.T, m @ m.T
@@ -147,23 +148,22 @@ def weights_of(features: ImageFeatures, to_basis: FloatArray, on_y: FloatArray) 
     ----------
     to_basis : (r, q)        on_y : (q,) c
     """
-    q, n = features.own.shape[0], features.residuals_px.shape[1]
-    flat = features.own.reshape(q, 2 * n)
+    q, n = features.num_own, features.rows.shape[2]
+    flat, y = features.rows[:q].reshape(q, 2 * n), features.rows[q].reshape(2 * n)
     along = to_basis @ flat
     leverage = np.einsum("rm,rm->m", along, along)
-    left = features.residuals_px.reshape(2 * n) - on_y @ flat
+    left = y - on_y @ flat
     weights = left / np.sqrt(1.0 - np.minimum(leverage, basis.MAX_LEVERAGE))
     return weights.reshape(2, n), float(leverage.max(initial=0.0))
 
 
 def scores_of(features: ImageFeatures, weights: FloatArray) -> FloatArray:
     """Return (q + 40, n): both rows of N and of each feature times weights (2, n), summed."""
-    q = len(features.own)
+    q = features.num_own
     out = np.empty((q + NUM_FEATURES, weights.shape[1]))
     of_features = out[q:]
-    np.einsum("cin,in->cn", features.own, weights, out=out[:q])
-    np.einsum("cin,in->cn", features.lens, weights, out=of_features[LENS])
-    np.einsum("cin,in->cn", features.shutter, weights, out=of_features[SHUTTER])
+    np.einsum("cin,in->cn", features.rows[:q], weights, out=out[:q])
+    np.einsum("cin,in->cn", features.rows[q + 1 :], weights, out=of_features[: SHUTTER.stop])
     np.multiply(features.monomials, weights[0], out=of_features[ALONG_X])
     np.multiply(features.monomials, weights[1], out=of_features[ALONG_Y])
     return out

@@ -22,7 +22,7 @@ from sfm_audit.audit.kernels.misfit import (
     misfit_sums,
     misfit_tracks,
 )
-from sfm_audit.audit.misfit.clusters import coincident_keypoints
+from sfm_audit.audit.misfit.clusters import pixels
 from sfm_audit.audit.misfit.features import (
     ImageFeatures,
     affine_offset,
@@ -205,7 +205,7 @@ class WindowSums:
         for b, features in enumerate(self._features):
             weights, leverage[b] = weights_of(features, basis[b], on_y[b])
             g = scores_of(features, weights)
-            clusters = Clusters.of(coincident_keypoints(self._source.keypoints(self.images[b])))
+            clusters = Clusters.of(pixels(self._source.keypoints(self.images[b])))
             if clusters is not None:
                 num_clusters[b] -= clusters.num_merged
                 clusters.merge(g)

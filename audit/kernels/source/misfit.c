@@ -530,10 +530,14 @@ KERNEL int64_t sfm_misfit_meat(WINDOW, const double *basis, const double *on_y, 
 
 /* g minus what the profile explains of it: g_j -= sum_i coefficients (q, 40) of (N w)_i. */
 static WIDE void project_scores(scores_t *s, int q, const double *coefficients) {
-    for (int j = 0; j < NUM_FEATURES; ++j)
-        for (int i = 0; i < q; ++i) {
-            const double factor = coefficients[i * NUM_FEATURES + j];
-            for (int k = 0; k < SIZE; ++k) s->g[q + j][k] -= factor * s->g[i][k];
+    for (int k = 0; k < SIZE; k += 8)
+        for (int j = 0; j < NUM_FEATURES; ++j) {
+            lanes left = *(const lanes *)&s->g[q + j][k], right = *(const lanes *)&s->g[q + j][k + 4];
+            for (int i = 0; i < q; ++i) {
+                const double factor = coefficients[i * NUM_FEATURES + j];
+                left -= factor * *(const lanes *)&s->g[i][k], right -= factor * *(const lanes *)&s->g[i][k + 4];
+            }
+            *(lanes *)&s->g[q + j][k] = left, *(lanes *)&s->g[q + j][k + 4] = right;
         }
 }
 
@@ -562,10 +566,10 @@ KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows
             weigh(b, q, basis + i * basis_rows * q, (int)basis_rows, on_y + i * q, &scratch->scores);
             fill_scores(b, q, &scratch->scores);
             project_scores(&scratch->scores, q, coefficients + i * q * NUM_FEATURES);
-            for (int k = 0; k < count; ++k) {
-                double *own = per_track + (track_of_point[point[b->rows[k]]] - first) * NUM_FEATURES;
-                for (int j = 0; j < NUM_FEATURES; ++j) own[j] += scratch->scores.g[q + j][k];
-            }
+            double *own[SIZE];
+            for (int k = 0; k < count; ++k) own[k] = per_track + (track_of_point[point[b->rows[k]]] - first) * NUM_FEATURES;
+            for (int j = 0; j < NUM_FEATURES; ++j)
+                for (int k = 0; k < count; ++k) own[k][j] += scratch->scores.g[q + j][k];
         }
     }
     free(to_free);
