@@ -46,8 +46,8 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
 from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
-from sfm_audit.audit.noise.fits import fit_constant_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
+from sfm_audit.audit.noise.stack import constant_sigmas
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels, build_table, schema
 from sfm_audit.audit.table.words import MisfitStatus
@@ -139,11 +139,7 @@ class ModelAuditor:
     @cached_property
     def sigma_constant_px(self) -> FloatArray:
         """Robust sd per axis of each image's raw residuals (I,), NaN where undetermined."""
-        variances = [
-            fit_constant_variance(self.residuals.residuals_px[:, self.residuals.rows(i)] ** 2).detector_px2
-            for i in range(len(self.model.images))
-        ]
-        return np.sqrt(np.array(variances, dtype=np.float64))
+        return constant_sigmas(self.residuals)
 
     @cached_property
     def tau_px(self) -> FloatArray:

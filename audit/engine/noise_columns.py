@@ -17,7 +17,7 @@ from sfm_audit.audit.normality import NormalityTests, normality_tests_of
 from sfm_audit.audit.table.arrow import Column
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
-_MAX_VALUES_AT_ONCE: Final = 1 << 16
+_MAX_INLIERS_AT_ONCE: Final = 1 << 17
 _MAX_IMAGES_AT_ONCE: Final = 512
 _NOISE: Final = ("sigma_d_px", "sigma_l", "sigma_predicted_px", "scale_ratio")
 _CHOSEN: Final = (
@@ -93,36 +93,38 @@ def noise_columns(
     tracks : where the chosen noise model is ``track``, else None
     noise_of : an image's noise under the chosen model, given its row and its noise of one scale
     """
-    parts: list[NoiseColumns] = []
-    waiting: list[tuple[ImageNoise, ImageNoise]] = []
-    num_values = 0
-    for constant, chosen in _noises(residuals, tracks, image_idxs, noise_of):
-        waiting.append((constant, chosen))
-        num_values += constant.z.size
-        if num_values > _MAX_VALUES_AT_ONCE or len(waiting) == _MAX_IMAGES_AT_ONCE:
-            parts.append(_fitted(waiting))
-            waiting, num_values = [], 0
-    parts.append(_fitted(waiting))
+    parts = [_fitted(_noises(residuals, tracks, part, noise_of)) for part in _parts(image_idxs, residuals.offsets)] or [
+        _fitted([])
+    ]
     return NoiseColumns(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in NoiseColumns.__slots__}
     )
 
 
+def _parts(image_idxs: range, offsets: IntArray) -> Iterator[range]:
+    """Yield consecutive images whose noise and tests are asked together, by their inliers' offsets (I + 1,)."""
+    start = image_idxs.start
+    while start < image_idxs.stop:
+        full = int(np.searchsorted(offsets, offsets[start] + _MAX_INLIERS_AT_ONCE, side="right")) - 1
+        stop = min(max(full, start + 1), start + _MAX_IMAGES_AT_ONCE, image_idxs.stop)
+        yield range(start, stop)
+        start = stop
+
+
 def _noises(
     residuals: ModelResiduals,
     tracks: ModelTracks | None,
-    image_idxs: range,
+    part: range,
     noise_of: Callable[[int, ImageNoise], ImageNoise],
-) -> Iterator[tuple[ImageNoise, ImageNoise]]:
-    """Yield the noise of each image under one scale and under the chosen model."""
-    for start in range(0, len(image_idxs), _MAX_IMAGES_AT_ONCE):
-        part = image_idxs[start : start + _MAX_IMAGES_AT_ONCE]
-        constants = constant_noises(residuals, part)
-        sigma_px = {image: noise.sigma_constant_px for image, noise in constants.items()}
-        chosens = {} if tracks is None else track_noises(tracks, part, sigma_px)
-        for image in part:
-            constant = constants.get(image) or constant_noise(residuals.residuals_px[:, residuals.rows(image)])
-            yield constant, chosens.get(image) or noise_of(image, constant)
+) -> list[tuple[ImageNoise, ImageNoise]]:
+    """The noise of each image of a part under one scale and under the chosen model."""
+    constants = constant_noises(residuals, part)
+    for image in part:
+        if image not in constants:
+            constants[image] = constant_noise(residuals.residuals_px[:, residuals.rows(image)])
+    sigma_px = {image: noise.sigma_constant_px for image, noise in constants.items()}
+    chosens = {} if tracks is None else track_noises(tracks, part, sigma_px)
+    return [(constants[image], chosens.get(image) or noise_of(image, constants[image])) for image in part]
 
 
 def _fitted(noises: Sequence[tuple[ImageNoise, ImageNoise]]) -> NoiseColumns:

@@ -20,6 +20,9 @@ _MAX_ITERATIONS = 60
 _STEP = 1.0 / 32.0  # node distance of the quantile tables in w
 _TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
 _NUM_CELLS = round(_TABLE_END / _STEP)
+LAST_STEP = 1e-6  # in ln f
+MIN_SLOPE = 1e-3  # of the robust variance in ln f, at which a step of Newton's is one
+_MANY, _EVERY = 256, 8  # observations, from which on every 8th says where to begin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +30,13 @@ class Prediction:
     """What the tracks predict for n observations: scale (n,) px of (4), degrees of freedom by table row.
 
     nu_values: (v,) the distinct nu = nu0 + nu_k.        nu_row: (n,) row of nu_values for each observation.
+    dof_values: (v,) the distinct nu_k.
     """
 
     scale_px: FloatArray
     nu_values: FloatArray
     nu_row: Int32Array
+    dof_values: IntArray
 
 
 def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: Int32Array | IntArray) -> Prediction:
@@ -42,7 +47,7 @@ def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: Int32Array |
     row = row_of[other_dof]
     nu = prior.nu0 + distinct.astype(np.float64)
     scale_sq = (prior.nu0 * prior.s0_px**2 + other_sq_px2) / nu[row]
-    return Prediction(np.sqrt(scale_sq), nu, row)
+    return Prediction(np.sqrt(scale_sq), nu, row, distinct)
 
 
 class StudentToNormal:
@@ -66,20 +71,33 @@ class StudentToNormal:
         cubic = [left, left_slope, 3.0 * rise - 2.0 * left_slope - right_slope, left_slope + right_slope - 2.0 * rise]
         self._coefficients = np.stack(cubic, axis=-1).reshape(-1, 4)
 
+    @property
+    def coefficients(self) -> FloatArray:
+        """Of the cubics (v * 193, 4) of z / w in cells of w, lowest power first; the last begins at w = 6."""
+        return self._coefficients
+
     def __call__(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         """Transform t (m,) with degrees of freedom nu (m,) = nu_values[nu_row]."""
-        w = np.sqrt(nu * np.log1p(t * t / nu))
+        return self.growing(t, nu_row, nu)[0]
+
+    def growing(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z (m,) and d z / d ln t, which is NaN where |w| > 6."""
+        t_sq = t * t
+        w = np.sqrt(nu * np.log1p(t_sq / nu))
         cell_position = w * (1.0 / _STEP)
         outside = np.flatnonzero(cell_position >= _NUM_CELLS)
         np.minimum(cell_position, _NUM_CELLS, out=cell_position)
         cell = cell_position.astype(np.int64)
-        c = self._coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0)
+        c0, c1, c2, c3 = self._coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0).T
         fraction = cell_position - cell
-        ratio = ((c[:, 3] * fraction + c[:, 2]) * fraction + c[:, 1]) * fraction + c[:, 0]
+        ratio = ((c3 * fraction + c2) * fraction + c1) * fraction + c0
+        steepness = ((3.0 * c3 * fraction + 2.0 * c2) * fraction + c1) * (1.0 / _STEP)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            growth = (ratio + w * steepness) * np.where(w > 0.0, nu * t_sq / ((nu + t_sq) * w), 0.0)
         z = np.copysign(w * ratio, t)
         if outside.size:
-            z[outside] = student_to_normal(t[outside], nu[outside])
-        return z
+            z[outside], growth[outside] = student_to_normal(t[outside], nu[outside]), math.nan
+        return z, np.copysign(growth, t)
 
 
 def _ratio_and_slope(nu: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -130,6 +148,17 @@ class StandardisedImage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """ln f, the step from there, z and d z / d ln t (m, 2) there."""
+
+    log_f: float
+    move: float
+    z: FloatArray
+    growth: FloatArray
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TrackStandardiser:
     """(5) for the images of one model: tables for x (nu) and for y given x (nu + 1)."""
 
@@ -142,6 +171,11 @@ class TrackStandardiser:
         """Tabulate the transformations that the model's degrees of freedom need."""
         return cls(prediction, StudentToNormal(prediction.nu_values), StudentToNormal(prediction.nu_values + 1.0))
 
+    @property
+    def tables(self) -> tuple[FloatArray, FloatArray]:
+        """The coefficients of both transformations."""
+        return self.first.coefficients, self.second.coefficients
+
     def standardise(self, whitened_px: FloatArray, rows: IntArray | slice) -> StandardisedImage:
         """Solve the image's factor f and return z at it.
 
@@ -151,8 +185,9 @@ class TrackStandardiser:
 
         Notes
         -----
-        f makes the robust variance of the pooled z equal to 1: mean(min(z^2, c^2)) = kappa, to 1e-10. The left side
-        decreases in f; the root is bracketed and refined by the secant rule.
+        f makes the robust variance of the pooled z equal to 1: mean(min(z^2, c^2)) = kappa. The left side decreases in
+        f: Newton within a bracket, of large images first on every 8th observation. The last step, below 1e-6 in ln f,
+        is one along the tangents of z.
         """
         prediction = self.prediction
         nu_row = prediction.nu_row[rows]
@@ -160,41 +195,60 @@ class TrackStandardiser:
         t = whitened_px / prediction.scale_px[rows]
         if t.size == 0 or not np.isfinite(t).all() or np.count_nonzero(t) * CUTOFF**2 <= t.size * CONSISTENCY:
             return StandardisedImage(np.full(t.T.shape, np.nan), math.nan, converged=False)
-        log_f, low, high = 0.0, -math.inf, math.inf
-        previous: tuple[float, float] | None = None
+        start = 0.0
+        if nu.size >= _MANY:
+            rough = self._solve((t[:, ::_EVERY], nu_row[::_EVERY], nu[::_EVERY]), 0.0, 1e-3)
+            start = rough.log_f + rough.move if rough.converged else 0.0
+        found = self._solve((t, nu_row, nu), start, LAST_STEP)
+        z = found.z - found.growth * found.move
+        log_f = found.log_f + found.move
+        row, axis = np.nonzero(np.isnan(found.growth))
+        if row.size:
+            z[row, axis] = self.transform(t[:, row] * math.exp(-log_f), nu_row[row], nu[row])[0][
+                np.arange(row.size), axis
+            ]
+        return StandardisedImage(z, math.exp(log_f), found.converged)
+
+    def _solve(self, image: tuple[FloatArray, Int32Array, FloatArray], log_f: float, tolerance: float) -> _Solution:
+        """Newton in ln f from ``log_f`` until a step is smaller than ``tolerance``; that step is not taken."""
+        t, nu_row, nu = image
+        low, high = -math.inf, math.inf
+        z, growth = np.empty((0, 2)), np.empty((0, 2))
         for _ in range(_MAX_ITERATIONS):
-            z = self._transform(t * math.exp(-log_f), nu_row, nu)
-            excess, slope = _robust_excess(z)
-            if abs(excess) <= 1e-10:
-                return StandardisedImage(z, math.exp(log_f), converged=True)
+            z, growth = self.transform(t * math.exp(-log_f), nu_row, nu)
+            excess, slope = robust_excess(z, growth)
             low, high = (log_f, high) if excess > 0 else (low, log_f)
-            if previous is not None and previous[1] != excess:
-                step = -excess * (log_f - previous[0]) / (excess - previous[1])
-            else:  # all clipped: no slope, and the factor is far too small
-                step = excess / slope if slope > 0 else math.copysign(math.inf, excess)
-            previous = log_f, excess
+            step = float(excess / slope) if slope > MIN_SLOPE else math.copysign(math.inf, excess)
+            if abs(step) <= tolerance:
+                return _Solution(log_f, step, z, growth, converged=True)
             log_f = _inside(log_f, step, low, high)
-        return StandardisedImage(z, math.exp(log_f), converged=False)
+        return _Solution(log_f, 0.0, z, growth, converged=False)
 
-    def transform_stack(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
-        """Return z (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m) = nu_values[nu_row]."""
+    def transform_stack(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z and d z / d ln t (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m)."""
         flat = np.ascontiguousarray(t.transpose(1, 0, 2)).reshape(2, -1)
-        return self._transform(flat, nu_row.reshape(-1), nu.reshape(-1)).reshape(*nu.shape, 2)
+        z, growth = self.transform(flat, nu_row.reshape(-1), nu.reshape(-1))
+        return z.reshape(*nu.shape, 2), growth.reshape(*nu.shape, 2)
 
-    def _transform(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
-        z = np.empty((t.shape[1], 2))
-        z[:, 0] = self.first(t[0], nu_row, nu)
-        z[:, 1] = self.second(t[1] * np.sqrt((nu + 1.0) / (nu + t[0] * t[0])), nu_row, nu + 1.0)
-        return z
+    def transform(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z and d z / d ln t (m, 2) of t (2, m) with the degrees of freedom nu (m,) = nu_values[nu_row]."""
+        z, growth = np.empty((t.shape[1], 2)), np.empty((t.shape[1], 2))
+        rest = nu + t[0] * t[0]
+        z[:, 0], growth[:, 0] = self.first.growing(t[0], nu_row, nu)
+        z[:, 1], growth[:, 1] = self.second.growing(t[1] * np.sqrt((nu + 1.0) / rest), nu_row, nu + 1.0)
+        growth[:, 1] *= nu / rest  # the scale of y grows with x
+        return z, growth
 
 
-def _robust_excess(z: FloatArray) -> tuple[float, float]:
-    """mean(min(z^2, c^2)) - kappa, and a guess of minus its derivative in ln f."""
-    sq = z.ravel() ** 2
+def robust_excess(z: FloatArray, growth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """mean(min(z^2, c^2)) - kappa of each of (..., m, 2), and minus its derivative in ln f."""
+    sq = z * z
     inside: BoolArray = sq < CUTOFF**2
-    unclipped = float(np.dot(sq, inside)) / sq.size
-    clipped = CUTOFF**2 * (1.0 - np.count_nonzero(inside) / sq.size)
-    return unclipped + clipped - CONSISTENCY, 2.0 * unclipped
+    size = sq.shape[-2] * sq.shape[-1]
+    axes = (-2, -1)
+    unclipped = np.where(inside, sq, 0.0).sum(axis=axes) / size
+    clipped = CUTOFF**2 * (1.0 - np.count_nonzero(inside, axis=axes) / size)
+    return unclipped + clipped - CONSISTENCY, 2.0 * np.where(inside, z * growth, 0.0).sum(axis=axes) / size
 
 
 def _inside(x: float, step: float, low: float, high: float) -> float:

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.noise.fits import CONSISTENCY, CUTOFF, UNDETERMINED, VarianceFit, fit_variance
-from sfm_audit.audit.noise.predictive import TrackStandardiser
-from sfm_audit.audit.noise.standardise import PREDICTOR_QUANTILE, ImageNoise, ModelTracks, track_noise
+from sfm_audit.audit.kernels import noise as kernel
+from sfm_audit.audit.noise.fits import (
+    CONSISTENCY,
+    CUTOFF,
+    UNDETERMINED,
+    VarianceFit,
+    fit_constant_variance,
+    fit_variance,
+)
+from sfm_audit.audit.noise.predictive import LAST_STEP, MIN_SLOPE, TrackStandardiser, robust_excess, student_to_normal
+from sfm_audit.audit.noise.standardise import PREDICTOR_QUANTILE, ImageNoise, ModelTracks, paper_fit, track_noise
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 MAX_OBSERVATIONS: Final = 64
@@ -20,13 +29,32 @@ _MIN_IMAGES: Final = 4
 _MAX_ITERATIONS: Final = 100
 
 
+def constant_sigmas(residuals: ModelResiduals) -> FloatArray:
+    """Return sigma_constant_px of all images (I,), NaN where undetermined."""
+    num_images = len(residuals.offsets) - 1
+    variances = np.full(num_images, math.nan)
+    if kernel.available():
+        variances = kernel.constant_variances(residuals.residuals_px, residuals.offsets, CONSISTENCY)
+    else:
+        for size, images in _by_size(np.diff(residuals.offsets), range(num_images)):
+            fits = fit_constant_variances((_residuals_px(residuals, images, size) ** 2).reshape(len(images), -1))
+            variances[images] = [fit.detector_px2 for fit in fits]
+    for image in np.flatnonzero(np.isnan(variances)).tolist():
+        variances[image] = fit_constant_variance(residuals.residuals_px[:, residuals.rows(image)] ** 2).detector_px2
+    return np.asarray(np.sqrt(variances), dtype=np.float64)
+
+
 def constant_noises(residuals: ModelResiduals, image_idxs: Sequence[int]) -> dict[int, ImageNoise]:
-    """Return `constant_noise` of the images of which several have the same, small number of inliers."""
-    starts = residuals.offsets[:-1]
+    """Return `constant_noise` of those images that can be fitted together.
+
+    With compiled kernels nearly all, where they follow each other; else those of which several have the same, small
+    number of inliers.
+    """
+    if kernel.available() and _follow_each_other(image_idxs):
+        return _compiled_constant_noises(residuals, image_idxs)
     out: dict[int, ImageNoise] = {}
     for size, images in _by_size(np.diff(residuals.offsets), image_idxs):
-        columns = starts[images][:, None] + np.arange(size)
-        residuals_px = np.ascontiguousarray(residuals.residuals_px[:, columns].transpose(1, 0, 2))  # (B, 2, n)
+        residuals_px = _residuals_px(residuals, images, size)
         fits = fit_constant_variances((residuals_px**2).reshape(len(images), -1))
         for image, own, fit in zip(images.tolist(), residuals_px, fits, strict=True):
             sigma = math.sqrt(fit.detector_px2)
@@ -37,7 +65,7 @@ def constant_noises(residuals: ModelResiduals, image_idxs: Sequence[int]) -> dic
 def track_noises(
     tracks: ModelTracks, image_idxs: Sequence[int], sigma_constant_px: Mapping[int, float]
 ) -> dict[int, ImageNoise]:
-    """Return `track_noise` of the images of which several have the same, small number of verified observations.
+    """Return `track_noise` of those images that can be looked at together, as `constant_noises` says.
 
     sigma_constant_px : of at least those images that are to be looked at
     """
@@ -45,11 +73,83 @@ def track_noises(
     out: dict[int, ImageNoise] = {}
     if tracks.standardiser is None:
         return out
+    if kernel.available() and _follow_each_other(known):
+        return _compiled_track_noises(tracks, tracks.standardiser, known, sigma_constant_px)
     verified = np.flatnonzero(tracks.statistics.verified)
     for size, images in _by_size(np.diff(tracks.verified_offsets), known):
         rows = tracks.verified_offsets[images][:, None] + np.arange(size)
         out.update(_noises_of_stack(tracks, tracks.standardiser, images, (rows, verified[rows]), sigma_constant_px))
     return out
+
+
+def _residuals_px(residuals: ModelResiduals, images: IntArray, size: int) -> FloatArray:
+    """Residuals (B, 2, n) of images with ``size`` inliers each."""
+    columns = residuals.offsets[images][:, None] + np.arange(size)
+    return np.ascontiguousarray(residuals.residuals_px[:, columns].transpose(1, 0, 2))
+
+
+def _follow_each_other(image_idxs: Sequence[int]) -> bool:
+    return len(image_idxs) > 0 and list(image_idxs) == list(range(image_idxs[0], image_idxs[0] + len(image_idxs)))
+
+
+def _compiled_constant_noises(residuals: ModelResiduals, image_idxs: Sequence[int]) -> dict[int, ImageNoise]:
+    offsets = residuals.offsets[image_idxs[0] : image_idxs[-1] + 2]
+    sigma_px = np.sqrt(kernel.constant_variances(residuals.residuals_px, offsets, CONSISTENCY))
+    known = np.isfinite(sigma_px)
+    standardised = np.divide(
+        residuals.residuals_px[:, offsets[0] : offsets[-1]].T, np.repeat(sigma_px, np.diff(offsets))[:, None], order="C"
+    )
+    starts = (offsets - offsets[0]).tolist()
+    return {
+        image: ImageNoise(
+            standardised[starts[k] : starts[k + 1]], sigma, sigma, math.nan, sigma, math.nan, converged=True
+        )
+        for k, (image, sigma) in enumerate(zip(image_idxs, sigma_px.tolist(), strict=True))
+        if known[k]
+    }
+
+
+def _compiled_track_noises(
+    tracks: ModelTracks,
+    standardiser: TrackStandardiser,
+    image_idxs: Sequence[int],
+    sigma_constant_px: Mapping[int, float],
+) -> dict[int, ImageNoise]:
+    part = slice(image_idxs[0], image_idxs[-1] + 2)
+    statistics, prior = tracks.statistics, tracks.prior
+    verified_offsets = tracks.verified_offsets[part]
+    found = kernel.Tracks(
+        *(statistics.whitened_px, statistics.verified, statistics.other_sq_px2, statistics.other_dof),
+        *(prior.nu0, prior.s0_px, standardiser.prediction.dof_values, standardiser.tables),
+    ).noises(tracks.offsets[part], verified_offsets, CONSISTENCY)
+    starts = (verified_offsets - verified_offsets[0]).tolist()
+    _transform_outside(found, standardiser, slice(int(verified_offsets[0]), int(verified_offsets[-1])))
+    out: dict[int, ImageNoise] = {}
+    with np.errstate(invalid="ignore"):
+        detector, structure = np.sqrt(found.detector_px2).tolist(), np.sqrt(found.structure).tolist()
+        predicted = (found.median_scale_px * np.sqrt(found.factor_sq)).tolist()
+    for k, image in enumerate(image_idxs):
+        if found.status[k] not in {kernel.DONE, kernel.FIT_IS_LEFT}:
+            continue
+        own = ImageNoise(
+            found.z[starts[k] : starts[k + 1]],
+            *(sigma_constant_px[image], detector[k], structure[k], predicted[k], float(found.factor_sq[k])),
+            converged=True,
+        )
+        if found.status[k] == kernel.FIT_IS_LEFT:
+            fit = paper_fit(tracks, image)
+            pair = math.sqrt(fit.detector_px2), math.sqrt(fit.structure)
+            own = replace(own, sigma_d_px=pair[0], sigma_l=pair[1], converged=fit.converged)
+        out[image] = own
+    return out
+
+
+def _transform_outside(found: kernel.TrackNoises, standardiser: TrackStandardiser, rows: slice) -> None:
+    """Transform the t that are beyond the tables, where z holds them."""
+    row, axis = np.nonzero(found.outside)
+    if row.size:
+        nu = standardiser.prediction.nu_values[standardiser.prediction.nu_row[rows][row]] + axis
+        found.z[row, axis] = student_to_normal(found.z[row, axis], nu)
 
 
 def _by_size(counts: IntArray, image_idxs: Sequence[int]) -> Iterator[tuple[int, IntArray]]:
@@ -163,42 +263,28 @@ def _standardised(
     size = 2 * rows.shape[1]
     z = np.full((len(t), rows.shape[1], 2), math.nan)
     possible = np.isfinite(t).all(axis=(1, 2)) & (np.count_nonzero(t, axis=(1, 2)) * CUTOFF**2 > size * CONSISTENCY)
-    log_f, before, before_excess = np.zeros(len(t)), np.full(len(t), math.nan), np.full(len(t), math.nan)
-    low, high = np.full(len(t), -math.inf), np.full(len(t), math.inf)
+    log_f, low, high = np.zeros(len(t)), np.full(len(t), -math.inf), np.full(len(t), math.inf)
     solved = np.zeros(len(t), dtype=bool)
     active = np.flatnonzero(possible)
     for _ in range(_MAX_ITERATIONS):
         if not active.size:
             break
-        found = standardiser.transform_stack(
-            t[active] * np.exp(-log_f[active])[:, None, None], nu_row[active], nu[active]
-        )
-        excess, slope = _robust_excesses(found)
-        ended = np.abs(excess) <= 1e-10
-        z[active[ended]], solved[active[ended]] = found[ended], True
-        active, excess, slope = active[~ended], excess[~ended], slope[~ended]
+        own = t[active], nu_row[active], nu[active]
+        found, growth = standardiser.transform_stack(own[0] * np.exp(-log_f[active])[:, None, None], *own[1:])
+        excess, slope = robust_excess(found, growth)
         x = log_f[active]
         low[active] = np.where(excess > 0, x, low[active])
         high[active] = np.where(excess > 0, high[active], x)
-        step = _steps(excess, slope, x - before[active], excess - before_excess[active])
-        before[active], before_excess[active] = x, excess
-        log_f[active] = _inside(x, step, low[active], high[active])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.where(slope > MIN_SLOPE, excess / slope, np.copysign(math.inf, excess))
+        ended = np.abs(step) <= LAST_STEP
+        log_f[active] = np.where(ended, x + step, _inside(x, step, low[active], high[active]))
+        last = active[ended]
+        if last.size:
+            by_f = np.exp(-log_f[last])[:, None, None]
+            z[last], solved[last] = standardiser.transform_stack(t[last] * by_f, nu_row[last], nu[last])[0], True
+        active = active[~ended]
     return z, log_f, solved
-
-
-def _robust_excesses(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """mean(min(z^2, c^2)) - kappa of each of (B, m, 2), and a guess of minus its derivative in ln f."""
-    sq = (z * z).reshape(len(z), -1)
-    inside = sq < CUTOFF**2
-    unclipped = np.where(inside, sq, 0.0).sum(axis=1) / sq.shape[1]
-    return unclipped + CUTOFF**2 * (1.0 - inside.sum(axis=1) / sq.shape[1]) - CONSISTENCY, 2.0 * unclipped
-
-
-def _steps(excess: FloatArray, slope: FloatArray, moved: FloatArray, changed: FloatArray) -> FloatArray:
-    """The secant's step; by the slope where there is no step before; without end where all are clipped."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_slope = np.where(slope > 0, excess / slope, np.copysign(math.inf, excess))
-        return np.where(np.isfinite(moved) & (changed != 0), -excess * moved / changed, by_slope)
 
 
 def _inside(x: FloatArray, step: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

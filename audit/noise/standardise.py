@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
+from sfm_audit.audit.noise.fits import VarianceFit, fit_constant_variance, fit_variance
 from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
 from sfm_audit.audit.noise.prior import TrackPrior, fit_track_prior
 from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
@@ -116,9 +116,7 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
         empty = np.full(whitened.T.shape, math.nan)
         return ImageNoise(empty, sigma_constant_px, math.nan, math.nan, math.nan, math.nan, converged=False)
     standardised = tracks.standardiser.standardise(whitened, own)
-    predictor = statistics.other_sq_px2[rows][verified] / statistics.other_dof[rows][verified]  # a_k^2 of (3)
-    predictor = np.minimum(predictor, _quantile(predictor, PREDICTOR_QUANTILE))
-    paper = fit_variance(whitened**2, predictor)
+    paper = paper_fit(tracks, image_idx)
     factor = standardised.factor
     return ImageNoise(
         standardised.z,
@@ -129,6 +127,15 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
         factor**2,
         paper.converged and standardised.converged,
     )
+
+
+def paper_fit(tracks: ModelTracks, image_idx: int) -> VarianceFit:
+    """The paper's form (1), with a_k of (3), for the verified observations of an image; at least one."""
+    statistics, rows = tracks.statistics, slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
+    verified = statistics.verified[rows]
+    whitened = statistics.whitened_px[:, rows].compress(verified, axis=1)
+    predictor = statistics.other_sq_px2[rows][verified] / statistics.other_dof[rows][verified]  # a_k^2 of (3)
+    return fit_variance(whitened**2, np.minimum(predictor, _quantile(predictor, PREDICTOR_QUANTILE)))
 
 
 def _quantile(values: FloatArray, q: float) -> float:

@@ -32,6 +32,13 @@ INLINE Lanes choose(LaneBits yes, Lanes a, Lanes b)
     return (Lanes)((yes & (LaneBits)a) | (~yes & (LaneBits)b));
 }
 
+INLINE void transpose(Lanes c[LANES])
+{
+    const Lanes a = c[0], b = c[1], d = c[2], e = c[3];
+    for (int i = 0; i < LANES; i++)
+        c[i] = (Lanes){a[i], b[i], d[i], e[i]};
+}
+
 INLINE Lanes root(Lanes x)
 {
     Lanes out;
@@ -44,26 +51,25 @@ INLINE Lanes root(Lanes x)
 INLINE Lanes mantissa(Lanes x) { return (Lanes)(((LaneBits)x & 0x000fffffffffffff) | 0x3ff0000000000000); }
 INLINE LaneBits biased_exponent(Lanes x) { return ((LaneBits)x >> 52) & 0x7ff; }
 
-/* ln(x + lost) of normal x > 0, |lost| far below x, to 1e-15 of itself. */
-INLINE Lanes log_of(Lanes x, Lanes lost)
+/* ln x of normal x > 0, to 1e-13 of itself or 1e-16. */
+INLINE Lanes log_of(Lanes x)
 {
     Lanes m = mantissa(x);
     const LaneBits upper = m > 1.4142135623730951;
     m = choose(upper, 0.5 * m, m);
     const LaneBits e = biased_exponent(x) - upper; /* true is -1 */
     const Lanes exponent = (Lanes)(e | 0x4330000000000000) - (4503599627370496.0 + 1023.0);
-    const Lanes f = (m - 1.0) / (m + 1.0), t = f * f; /* ln m = 2 (f + f^3 / 3 + f^5 / 5 ...), t < 0.0295 */
-    Lanes p = all(1.0 / 21.0);
-    for (int k = 19; k > 1; k -= 2)
-        p = p * t + 1.0 / k;
-    return exponent * LN2_HIGH + (2.0 * f + (2.0 * f * t * p + (exponent * LN2_LOW + lost / x)));
+    const Lanes f = (m - 1.0) / (m + 1.0), t = f * f, t2 = t * t; /* ln m = 2 (f + f^3 / 3 + f^5 / 5 ...), t < 0.0295 */
+    const Lanes even = ((t2 * (1.0 / 15.0) + 1.0 / 11.0) * t2 + 1.0 / 7.0) * t2 + 1.0 / 3.0;
+    const Lanes odd = ((t2 * (1.0 / 17.0) + 1.0 / 13.0) * t2 + 1.0 / 9.0) * t2 + 1.0 / 5.0;
+    return exponent * LN2_HIGH + (2.0 * f + (2.0 * f * t * (even + t * odd) + exponent * LN2_LOW));
 }
 
-/* ln(1 + u), u >= 0, 1 + u finite, to 1e-15 of itself. */
+/* ln(1 + u), u >= 0, 1 + u finite, to 1e-13 of itself. */
 INLINE Lanes log_1p(Lanes u)
 {
     const Lanes x = 1.0 + u;
-    return log_of(x, u - (x - 1.0));
+    return log_of(x) + choose(x < 2.0, u - (x - 1.0), all(0.0)); /* what the sum has lost; elsewhere it is nothing */
 }
 
 /* exp(x), x <= 0; 0 below -708. */

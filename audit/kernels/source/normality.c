@@ -12,8 +12,9 @@ typedef struct {
     int32_t *bucket, *count;
 } Room;
 
-/* Distribution function of the normal distribution to 1e-15: a series of five terms about the next node. */
-INLINE Lanes normal_cdf(const double *tails, Lanes z)
+/* Distribution function of the normal distribution: to 1e-15 by a series of five terms about the next node, or to 1e-5
+ * by one. */
+INLINE Lanes normal_cdf(const double *tails, Lanes z, int roughly)
 {
     const LaneBits negative = z < 0.0;
     Lanes a = choose(negative, -z, z);
@@ -21,14 +22,16 @@ INLINE Lanes normal_cdf(const double *tails, Lanes z)
     a = choose(a > end, end, a);
     const Lanes shifted = a * CELLS + WHOLE, node = (shifted - WHOLE) / CELLS, d = a - node, n2 = node * node;
     const LaneBits at = (LaneBits)shifted & 0x3ff;
-    Lanes tail, density;
+    Lanes tail, density, s = all(0.0);
     for (int l = 0; l < LANES; l++) {
         tail[l] = tails[2 * at[l]];
         density[l] = tails[2 * at[l] + 1];
     }
-    Lanes s = (n2 * n2 - 6.0 * n2 + 3.0) * (1.0 / 120.0) * d - (n2 - 3.0) * node * (1.0 / 24.0);
-    s = (s * d + (n2 - 1.0) * (1.0 / 6.0)) * d - 0.5 * node;
-    const Lanes q = tail - density * ((s * d + 1.0) * d);
+    if (!roughly) {
+        s = (n2 * n2 - 6.0 * n2 + 3.0) * (1.0 / 120.0) * d - (n2 - 3.0) * node * (1.0 / 24.0);
+        s = ((s * d + (n2 - 1.0) * (1.0 / 6.0)) * d - 0.5 * node) * d;
+    }
+    const Lanes q = tail - density * ((s + 1.0) * d);
     return choose(negative, q, 1.0 - q);
 }
 
@@ -54,7 +57,7 @@ INLINE Lanes outer_score(Lanes p)
                                3.64784832476320460504, 5.7694972214606914055, 4.6303378461565452959, 1.42343711074968357734};
     static const double d[] = {1.05075007164441684324e-9, 5.475938084995344946e-4, 0.0151986665636164571966, 0.14810397642748007459,
                                0.68976733498510000455, 1.6763848301838038494, 2.05319162663775882187, 1.0};
-    const Lanes r = root(-log_of(p, all(0.0))) - 1.6;
+    const Lanes r = root(-log_of(p)) - 1.6;
     Lanes up = all(c[0]), down = all(d[0]);
     for (int i = 1; i < 8; i++) {
         up = up * r + c[i];
@@ -118,32 +121,72 @@ INLINE Lanes some(const double *x, int64_t used)
 }
 #define USED(n, k) ((n) - (k) < LANES ? (n) - (k) : LANES)
 
-/* Kolmogorov's distance, of distribution functions that come in ascending order, four at a time. */
-typedef struct {
-    Lanes rank, least, most;
-} Distance;
+enum { NORMAL, EXPONENTIAL };
 
-INLINE void ask(Distance *d, Lanes cdf, double by_n, int64_t used)
+INLINE Lanes cdf_of(int kind, const Room *room, Lanes x, double shift, double scale)
 {
-    Lanes excess = cdf - d->rank * by_n;
-    if (used < LANES)
-        for (int l = (int)used; l < LANES; l++)
-            excess[l] = excess[0];
-    d->least = choose(excess < d->least, excess, d->least);
-    d->most = choose(excess > d->most, excess, d->most);
-    d->rank += (double)LANES;
+    return kind == NORMAL ? normal_cdf(room->tails, (x - shift) * scale, 0) : 1.0 - exp_of_negative(-x * scale);
 }
 
-static Distance start(void) { return (Distance){{1.0, 2.0, 3.0, 4.0}, all(DBL_MAX), all(-DBL_MAX)}; }
+/* F(x_(i)) - i / n, i from 1: where it is least, and where most. */
+typedef struct {
+    Lanes least, most;
+} Excess;
 
-static double answer(const Distance *d, double by_n)
+INLINE void widen(Excess *excess, Lanes cdf, Lanes rank, double n)
 {
-    double least = d->least[0], most = d->most[0];
+    const Lanes own = cdf - rank / n;
+    excess->least = choose(own < excess->least, own, excess->least);
+    excess->most = choose(own > excess->most, own, excess->most);
+}
+
+INLINE void settle(Excess *excess)
+{
     for (int l = 1; l < LANES; l++) {
-        least = d->least[l] < least ? d->least[l] : least;
-        most = d->most[l] > most ? d->most[l] : most;
+        excess->least[0] = excess->least[l] < excess->least[0] ? excess->least[l] : excess->least[0];
+        excess->most[0] = excess->most[l] > excess->most[0] ? excess->most[l] : excess->most[0];
     }
-    return most + by_n > -least ? most + by_n : -least;
+    excess->least = all(excess->least[0]);
+    excess->most = all(excess->most[0]);
+}
+
+/* Kolmogorov's distance of n sorted numbers. Every STEP-th is asked, then those between two of them where it may be larger: a
+ * distribution function rises nowhere by more than between its ends. Uses room->scratch. */
+enum { STEP = 16 };
+
+INLINE double distance(int kind, int64_t n, const Room *room, double shift, double scale)
+{
+    const double *x = room->sorted, size = (double)n;
+    double *at = room->scratch;
+    const int64_t num = (n + STEP - 2) / STEP + 1; /* 0, STEP, 2 STEP ... n - 1 */
+    Excess d = {all(DBL_MAX), all(-DBL_MAX)};
+    for (int64_t i = 0; i < num; i += LANES) {
+        Lanes value = all(0.0), rank = all(0.0);
+        for (int l = 0; l < LANES; l++) {
+            const int64_t place = (i + l) * STEP < n ? (i + l) * STEP : n - 1;
+            value[l] = x[place];
+            rank[l] = (double)(place + 1);
+        }
+        const Lanes cdf = cdf_of(kind, room, value, shift, scale);
+        widen(&d, cdf, rank, size);
+        store(at + i, cdf);
+    }
+    settle(&d);
+    for (int64_t i = 0; i + 1 < num; i++) {
+        const int64_t from = i * STEP, to = from + STEP < n - 1 ? from + STEP : n - 1;
+        const double high = at[i + 1] - (double)(from + 2) / size, low = at[i] - (double)to / size;
+        if (!(high > d.most[0] || low < d.least[0]))
+            continue;
+        for (int64_t k = from; k < to; k += LANES) {
+            if (n - k >= LANES)
+                widen(&d, cdf_of(kind, room, load(x + k), shift, scale), (Lanes){1.0, 2.0, 3.0, 4.0} + (double)k, size);
+            else
+                for (int64_t one = k; one < n; one++)
+                    widen(&d, cdf_of(kind, room, all(x[one]), shift, scale), all((double)(one + 1)), size);
+        }
+        settle(&d);
+    }
+    return d.most[0] + 1.0 / size > -d.least[0] ? d.most[0] + 1.0 / size : -d.least[0];
 }
 
 /* Mean and central moments of (n,) numbers; not DONE where they are not finite, all equal, or out of range. */
@@ -187,7 +230,7 @@ INLINE int moments(int64_t n, const double *x, double *mean, double m[3])
 INLINE void sort_normal(int64_t n, const double *x, Room *room)
 {
     for (int64_t k = 0; k < n; k += LANES)
-        assign(normal_cdf(room->tails, some(x + k, USED(n, k))), n, USED(n, k), room->bucket + k);
+        assign(normal_cdf(room->tails, some(x + k, USED(n, k)), 1), n, USED(n, k), room->bucket + k);
     sort(n, x, room);
 }
 
@@ -229,20 +272,13 @@ INLINE void shapiro(int64_t n, const double *sorted, double *out)
 INLINE int statistics(int64_t n, const double *z, Room *room, double *out)
 {
     const int64_t num_values = 2 * n, step = (num_values + MAX_SHAPIRO - 1) / MAX_SHAPIRO;
-    const double by_n = 1.0 / (double)num_values, by_points = 1.0 / (double)n;
     double mean;
     if (n < 1 || moments(num_values, z, &mean, out + M2) != DONE)
         return NEEDS_NUMPY;
     const double by_sd = 1.0 / sqrt(out[M2] * (double)num_values / (double)(num_values - 1));
     sort_normal(num_values, z, room);
-    Distance plain = start(), fitted = start();
-    for (int64_t k = 0; k < num_values; k += LANES) {
-        const Lanes x = some(room->sorted + k, USED(num_values, k));
-        ask(&plain, normal_cdf(room->tails, x), by_n, USED(num_values, k));
-        ask(&fitted, normal_cdf(room->tails, (x - mean) * by_sd), by_n, USED(num_values, k));
-    }
-    out[KS] = answer(&plain, by_n);
-    out[FITTED] = answer(&fitted, by_n);
+    out[KS] = distance(NORMAL, num_values, room, 0.0, 1.0);
+    out[FITTED] = distance(NORMAL, num_values, room, mean, by_sd);
     out[SS] = out[M2] * (double)num_values;
     if (step == 1) {
         shapiro(num_values, room->sorted, out);
@@ -268,15 +304,9 @@ INLINE int statistics(int64_t n, const double *z, Room *room, double *out)
         assign(1.0 - exp_of_negative(-half), n, used, room->bucket + k);
     }
     sort(n, room->scratch, room);
-    const double by_mean = 1.0 / (sum(total) * by_points);
-    Distance scaled = start(), unscaled = start();
-    for (int64_t k = 0; k < n; k += LANES) {
-        const Lanes x = some(room->sorted + k, USED(n, k));
-        ask(&scaled, 1.0 - exp_of_negative(-x * by_mean), by_points, USED(n, k));
-        ask(&unscaled, 1.0 - exp_of_negative(-x), by_points, USED(n, k));
-    }
-    out[LENGTHS] = answer(&scaled, by_points);
-    out[LENGTHS_UNSCALED] = answer(&unscaled, by_points);
+    const double by_mean = 1.0 / (sum(total) / (double)n);
+    out[LENGTHS] = distance(EXPONENTIAL, n, room, 0.0, by_mean);
+    out[LENGTHS_UNSCALED] = distance(EXPONENTIAL, n, room, 0.0, 1.0);
     return DONE;
 }
 

@@ -165,8 +165,8 @@ KERNEL WIDE int64_t prior_sums(int64_t num_groups, const int64_t *starts, const 
                 exponents_ratio += biased_exponent(ratio);
                 exponents_bq += biased_exponent(bq);
             }
-            log_ratio += sum(log_of(of_ratio, all(0.0)));
-            log_bq += sum(log_of(of_bq, all(0.0)));
+            log_ratio += sum(log_of(of_ratio));
+            log_bq += sum(log_of(of_bq));
         }
         const int64_t rows = starts[g + 1] - starts[g], filled = rows - counts[g];
         out[6 * g] = log_ratio + (double)(total(exponents_ratio) - 1023 * rows) * M_LN2;
