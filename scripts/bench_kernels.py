@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.consistency import consistency_of
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.engine.quality import spread_of_images
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
 from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
@@ -60,6 +61,13 @@ def cameras(model: SparseModel) -> Callable[[], object]:
     return lambda: camera_tests_of_sums(model, residuals, images)
 
 
+def spread(model: SparseModel) -> Callable[[], object]:
+    """Hull, occupied cells and median depth of all images."""
+    residuals, images = model_residuals(model), range(len(model.images))
+    cameras = [model.camera(int(idx)) for idx in model.images.camera_idx]
+    return lambda: spread_of_images(cameras, model, residuals, images, 8)
+
+
 def witnesses(model: SparseModel) -> Callable[[], object]:
     """What the model says of its images outside of each: who shares points with whom, who should see what."""
     auditor = ModelAuditor(model)
@@ -72,6 +80,7 @@ SUBJECTS: Final[dict[str, Callable[[SparseModel], Callable[[], object]]]] = {
     "consistency": consistency,
     "misfit": misfit,
     "cameras": cameras,
+    "spread": spread,
     "witnesses": witnesses,
 }
 """From a model to what is timed; what it needs of the model is made before."""

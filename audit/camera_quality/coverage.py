@@ -32,12 +32,21 @@ def spread_of(xy_px: FloatArray, offsets: IntArray, cameras: Sequence[CameraReco
     ----------
     xy_px : (n, 2) observed, image after image; image b owns rows offsets[b]:offsets[b + 1]        offsets : (B + 1,)
     """
-    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
-    hulls = [hull_area_px2(xy_px[first:last]) for first, last in pairwise(offsets.tolist())]
-    area = size[:, 0] * size[:, 1]
+    size_px = sizes_of(cameras)
+    hulls = np.array([hull_area_px2(xy_px[first:last]) for first, last in pairwise(offsets.tolist())], dtype=np.float64)
+    return Spread(covered(hulls, size_px), cells_of(xy_px, offsets, size_px, grid))
+
+
+def sizes_of(cameras: Sequence[CameraRecord]) -> FloatArray:
+    """Return (B, 2) width and height, px."""
+    return np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64).reshape(-1, 2)
+
+
+def covered(hull_px2: FloatArray, size_px: FloatArray) -> FloatArray:
+    """Return `coverage` of B images from the areas of their hulls (B,) and their sizes (B, 2)."""
+    area = size_px[:, 0] * size_px[:, 1]
     with np.errstate(all="ignore"):
-        covered = np.where(area > 0.0, hulls / area, np.nan)
-    return Spread(covered, cells_of(xy_px, offsets, size, grid))
+        return np.where(area > 0.0, hull_px2 / area, np.nan)
 
 
 def hull_area_px2(xy_px: FloatArray) -> float:
@@ -53,8 +62,7 @@ def hull_area_px2(xy_px: FloatArray) -> float:
     if len(points) < 3:
         return 0.0
     left, right = points[0], points[-1]
-    chains = _chain(points), _chain(points[::-1])
-    twice = sum(_turn(left, start, end) for chain in chains for start, end in pairwise(chain))
+    twice = _fan(left, _chain(points)) + _fan(left, _chain(points[::-1]))
     tall = max(y for _, y in points) - min(y for _, y in points)
     wide = right[0] - left[0]
     return 0.5 * twice if twice > _FLAT * (wide * wide + tall * tall) else 0.0
@@ -68,6 +76,14 @@ def _chain(points: list[_Point]) -> list[_Point]:
             out.pop()
         out.append(point)
     return out
+
+
+def _fan(centre: _Point, chain: list[_Point]) -> float:
+    """Twice the area of the triangles from a point to the edges of a chain."""
+    twice = 0.0
+    for start, end in pairwise(chain):  # Python's sum rounds as its version likes
+        twice += _turn(centre, start, end)
+    return twice
 
 
 def _turn(a: _Point, b: _Point, c: _Point) -> float:

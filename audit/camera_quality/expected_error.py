@@ -14,7 +14,7 @@ import numpy as np
 from sfm_audit.audit.camera_quality.identifiability import POSE_NAMES, ParameterCovariance, fitted_names
 from sfm_audit.audit.camera_quality.shapes import GRID, cell_centres_px, columns_of_grids, rays_of_grids
 from sfm_audit.audit.cameras.columns import EPSILON
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
@@ -65,6 +65,16 @@ def median_depth(camera: CameraRecord, xyz_cam: FloatArray) -> float:
     if not len(xyz_cam):
         return math.nan
     return float(np.median(depths(camera, xyz_cam)))
+
+
+def medians_of(values: FloatArray, offsets: IntArray) -> FloatArray:
+    """Return medians (B,) of values (n,), image b owning offsets[b]:offsets[b + 1]; NaN without any."""
+    num = np.diff(offsets)
+    out = np.full(len(num), np.nan)
+    for size in distinct(num[num > 0]).tolist():  # of many small images few are different
+        alike = np.flatnonzero(num == size)
+        out[alike] = np.median(values[offsets[alike][:, None] + np.arange(size)], axis=1)
+    return out
 
 
 def depths(camera: CameraRecord, xyz_cam: FloatArray) -> FloatArray:

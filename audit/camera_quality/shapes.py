@@ -10,7 +10,7 @@ import numpy as np
 from sfm_audit.audit.cameras import project_columns, unproject
 from sfm_audit.audit.inliers.stationarity import pose_columns
 from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
@@ -38,8 +38,16 @@ def params_by_point(cameras: Sequence[CameraRecord], num_each: int) -> FloatArra
 
 def cell_centres_px(width: int, height: int, grid: int = GRID) -> FloatArray:
     """Return (grid, grid, 2) px: centres of grid x grid equal cells of the image; [row, column] as in an image."""
+    return np.asarray(_grids_px(np.array([[width, height]]), grid)[0])
+
+
+def _grids_px(size_px: FloatArray | IntArray, grid: int) -> FloatArray:
+    """Return `cell_centres_px` of sizes (C, 2): (C, grid, grid, 2)."""
     share = (np.arange(grid) + 0.5) / grid
-    return np.stack(np.meshgrid(share * width, share * height), axis=-1)
+    out = np.empty((len(size_px), grid, grid, 2))
+    out[..., 0] = (share * size_px[:, :1])[:, None, :]
+    out[..., 1] = (share * size_px[:, 1:])[:, :, None]
+    return out
 
 
 def rays_of_grids(cameras: Sequence[CameraRecord], grid: int = GRID) -> FloatArray:
@@ -49,7 +57,7 @@ def rays_of_grids(cameras: Sequence[CameraRecord], grid: int = GRID) -> FloatArr
     ----------
     cameras : C of one model that `in_stacks` put together
     """
-    pixels = np.stack([cell_centres_px(camera.width, camera.height, grid) for camera in cameras])
+    pixels = _grids_px(np.array([(camera.width, camera.height) for camera in cameras]), grid)
     params = params_by_point(cameras, grid * grid)
     return unproject(cameras[0].model, params, pixels.reshape(-1, 2)).reshape(len(cameras), grid * grid, 3)
 

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.coverage import Spread, spread_of
+from sfm_audit.audit.camera_quality.coverage import Spread, covered, sizes_of, spread_of
+from sfm_audit.audit.camera_quality.expected_error import medians_of
 from sfm_audit.audit.camera_quality.identifiability import unit_triangle
 from sfm_audit.audit.camera_quality.joined import sums_of_joined
 from sfm_audit.audit.camera_quality.measure import (
@@ -22,11 +23,12 @@ from sfm_audit.audit.camera_quality.measure import (
 from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.kernels.spread import Inliers, image_spread
 from sfm_audit.audit.misfit import MisfitTests, nuisance_columns
 from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel, moved
+from sfm_audit.loaders.model import CameraRecord, SparseModel, moved
 
 _MAX_POINTS_AT_ONCE: Final = 4096
 _POINTS_IN_A_TURN: Final = 1 << 16
@@ -53,8 +55,8 @@ def quality_of_images(
     asked = [place for place, shape in enumerate(by_image) if num_inliers[place] and shape is not None]
     for places in _in_turns(asked, num_inliers):
         own, of_images = [images[place] for place in places], [shape for place in places if (shape := by_image[place])]
-        misfits, sums = _sums_of(of_images, model, residuals, own)
-        seen = _spread_of(of_images, model, residuals, own, grid)
+        seen, depth = spread_of_images([shape.camera for shape in of_images], model, residuals, own, grid)
+        misfits, sums = _sums_of(of_images, model, residuals, own, depth)
         for place, quality in zip(places, qualities_of(of_images, misfits, sums, seen, sigma_px[own]), strict=True):
             out[place] = quality
     return out
@@ -81,9 +83,13 @@ def _shapes_of(model: SparseModel, image_idxs: Sequence[int]) -> dict[int, Camer
 
 
 def _sums_of(
-    shapes: Sequence[CameraShape], model: SparseModel, residuals: ModelResiduals, image_idxs: Sequence[int]
+    shapes: Sequence[CameraShape],
+    model: SparseModel,
+    residuals: ModelResiduals,
+    image_idxs: Sequence[int],
+    depth: FloatArray,
 ) -> tuple[list[MisfitTests], list[PointSums]]:
-    """What the inliers of images, with their cameras' shapes, add up to; of small images together."""
+    """What the inliers of images, with their cameras' shapes and depths, add up to; of small images together."""
     alike: dict[tuple[int, int], list[int]] = {}
     out: dict[int, tuple[MisfitTests, PointSums]] = {}
     num_of = np.diff(residuals.offsets)
@@ -94,9 +100,8 @@ def _sums_of(
         if num_inliers <= MAX_JOINED:
             alike.setdefault((int(model.images.camera_idx[image_idx]), num_inliers), []).append(place)
         elif image_idx in tested:
-            depth = _median_depth(model, image_idx, residuals.point_idx[rows])
-            triangle = partial(_triangle_of, model, residuals, image_idx)
-            out[place] = tested[image_idx].tests, PointSums(tested[image_idx].gram, 2 * num_inliers, depth, triangle)
+            triangle, far = partial(_triangle_of, model, residuals, image_idx), float(depth[place])
+            out[place] = tested[image_idx].tests, PointSums(tested[image_idx].gram, 2 * num_inliers, far, triangle)
         elif num_inliers <= AT_ONCE:
             out[place] = image_sums(shape.camera, image_inliers(model, residuals, image_idx))
         else:
@@ -110,13 +115,6 @@ def _sums_of(
     return [out[place][0] for place in range(len(out))], [out[place][1] for place in range(len(out))]
 
 
-def _median_depth(model: SparseModel, image_idx: int, point_idx: IntArray) -> float:
-    """`median_depth` of an image whose camera is no panorama."""
-    quat, translation = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
-    xyz_cam = moved(quat[image_idx], translation[image_idx], model.points.xyz_world.take(point_idx, axis=0))
-    return float(np.median(xyz_cam[:, 2]))
-
-
 def _triangle_of(model: SparseModel, residuals: ModelResiduals, image_idx: int, norms: FloatArray) -> FloatArray:
     """`unit_triangle` of an image's columns."""
     own = image_inliers(model, residuals, image_idx)
@@ -124,13 +122,24 @@ def _triangle_of(model: SparseModel, residuals: ModelResiduals, image_idx: int, 
     return unit_triangle(columns.reshape(len(columns), -1), norms)
 
 
-def _spread_of(
-    shapes: Sequence[CameraShape], model: SparseModel, residuals: ModelResiduals, image_idxs: Sequence[int], grid: int
-) -> Spread:
-    """How far the inliers of images spread."""
-    own = np.array(image_idxs, dtype=np.int64)
+def spread_of_images(
+    cameras: Sequence[CameraRecord],
+    model: SparseModel,
+    residuals: ModelResiduals,
+    image_idxs: Sequence[int],
+    grid: int,
+) -> tuple[Spread, FloatArray]:
+    """Return how far the inliers of images spread, whose cameras are given, and their median Zc (B,), model units."""
+    own, size_px = np.array(image_idxs, dtype=np.int64), sizes_of(cameras)
+    observed = residuals.observation_row, residuals.point_idx, model.observations.xy_px, model.points.xyz_world
+    poses = model.images.quat_cam_from_world_wxyz, model.images.translation_cam_from_world
+    lie = image_spread(Inliers(residuals.offsets, *observed, *poses), own, size_px, grid)
+    if lie is not None:
+        return Spread(covered(lie.hull_px2, size_px), lie.occupied_cells), lie.median_depth
     first, last = residuals.offsets[own], residuals.offsets[own + 1]
     offsets: IntArray = np.concatenate([[0], np.cumsum(last - first)])
     columns = np.repeat(first - offsets[:-1], last - first) + np.arange(offsets[-1])
     xy_px = model.observations.xy_px.take(residuals.observation_row[columns], axis=0)
-    return spread_of(xy_px, offsets, [shape.camera for shape in shapes], grid)
+    quats, shifts = (np.repeat(each[own], last - first, axis=0).T for each in poses)
+    xyz_world = model.points.xyz_world.take(residuals.point_idx[columns], axis=0)
+    return spread_of(xy_px, offsets, cameras, grid), medians_of(moved(quats, shifts, xyz_world)[:, 2], offsets)
