@@ -45,6 +45,7 @@ from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
+from sfm_audit.audit.kernels.threads import together
 from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.stack import constant_sigmas
@@ -330,7 +331,8 @@ class ModelAuditor:
     def tables(self, labels: ModelLabels | None = None, *, observations: bool = False) -> ModelAudit:
         """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
         labels = labels or self._own_labels
-        _ = self.joint, self.cameras, self.tracks, self.outside  # before the images are spread
+        _ = self.tau_px, self.moved, self.consistency  # what all of these ask, before the images are spread
+        together(lambda: self.joint, lambda: (self.cameras, self.tracks, self.outside))
         _ = self.config.noise == "keypoint" and self.keypoint_tracks
         parts = self._spread(partial(audit_images, labels=labels), self)
         said = Said.together([part.said for part in parts])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -79,6 +80,35 @@ def over_ranges(
     if number <= 1:
         return [function(part.start, part.stop) for part in parts]
     return _in_threads(function, parts, number)
+
+
+def together(first: Callable[[], object], second: Callable[[], object]) -> None:
+    """Call both, at the same time where two threads may work; neither may need what the other computes.
+
+    Whoever interrupts the first does not wait for the second: its thread ends with the process.
+    """
+    if num_threads() <= 1:
+        first()
+        second()
+        return
+    errors: list[BaseException] = []
+
+    def keeping_errors() -> None:
+        try:
+            second()
+        except BaseException as error:  # noqa: BLE001 - raised again below
+            errors.append(error)
+
+    thread = threading.Thread(target=_context_of_one().run, args=(keeping_errors,), name="sfm-audit", daemon=True)
+    thread.start()
+    try:
+        _context_of_one().run(first)
+    except Exception:
+        thread.join()
+        raise
+    thread.join()
+    if errors:
+        raise errors[0]
 
 
 def _in_threads(function: Callable[[int, int], T], parts: Sequence[range], number: int) -> list[T]:

@@ -131,7 +131,8 @@ def _one_sided(distance: FloatArray, num_values: IntArray, factorials: FloatArra
     log_terms += (count - 1.0) * np.log(distance + fraction)
     log_terms += (num_values - count) * np.log(np.where(inside, rest, 1.0))
     terms = np.exp(np.where(inside, log_terms, -math.inf))
-    return np.asarray((distance * stride)[:, 0] * terms.sum(axis=1))
+    # One after the other: a sum in pairs would depend on how many terms the largest sample beside this one has.
+    return np.asarray((distance * stride)[:, 0] * terms.cumsum(axis=1)[:, -1])
 
 
 def _log_factorials(largest: int) -> FloatArray:

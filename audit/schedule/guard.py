@@ -55,7 +55,7 @@ def _report(task: Task, error: Exception) -> str:
         f"model: {task.ref.model_path}",
         f"versions: {', '.join(versions)}, on {platform.platform()}",
         f"settings: {task.config.model_dump_json()}",
-        f"observations: {task.observations}, processes: {task.num_processes}",
+        f"observations: {task.observations}, processes: {task.num_processes}, threads: {task.num_threads}",
         "",
         "".join(traceback.format_exception(error, limit=_FRAMES)),
     ]

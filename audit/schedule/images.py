@@ -38,11 +38,12 @@ _serial = itertools.count()
 
 
 @contextmanager
-def image_processes(num_processes: int, paths: set[str]) -> Iterator[Spread]:
+def image_processes(num_processes: int, paths: set[str] | None = None) -> Iterator[Spread]:
     """Yield a way to run a function over the images of a model: in turn, or in that many processes.
 
-    paths: to which those processes add the path that their numbers take, compiled kernels or numpy.
+    paths: a set to which those processes add the path that their numbers take, compiled kernels or numpy.
     """
+    seen = set() if paths is None else paths
     if num_processes <= 1 or not _OPEN_FILES.exists():
         yield in_turn
         return
@@ -56,7 +57,7 @@ def image_processes(num_processes: int, paths: set[str]) -> Iterator[Spread]:
                 except OSError:  # no room for it: this process has all it needs
                     return in_turn(function, auditor)
                 place = f"/proc/{os.getpid()}/fd/{file.fileno()}", next(_serial)
-                return _gather(lanes, num_processes, len(auditor.model.images), (place, function), paths)
+                return _gather(lanes, num_processes, len(auditor.model.images), (place, function), seen)
 
         yield spread
 

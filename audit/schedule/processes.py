@@ -28,16 +28,16 @@ def in_processes(plan: Sequence[Task], jobs: int, audit: AuditFunction) -> Gener
     num_at_work = 0
     with Lanes[Task]() as lanes:
         while waiting or lanes.num_busy:
-            while waiting and num_at_work + waiting[0].num_processes <= jobs:
+            while waiting and num_at_work + _num_at_work(waiting[0]) <= jobs:
                 task = waiting.popleft()
-                num_at_work += task.num_processes
+                num_at_work += _num_at_work(task)
                 _start(lanes, audit, task)
             yield from ended  # what the caller does with them is done while the processes work on
             ended = []
             for task, answer in lanes.wait():
-                num_at_work -= task.num_processes
+                num_at_work -= _num_at_work(task)
                 if isinstance(answer, Died):
-                    again.append(replace(task, num_processes=1))
+                    again.append(replace(task, num_processes=1, num_threads=1))
                 elif isinstance(answer, Exceeded):
                     ended.append((task, exceeded(task, answer)))
                 else:
@@ -64,20 +64,27 @@ def _start(lanes: Lanes[Task], audit: AuditFunction, task: Task) -> None:
 
 
 def planned(tasks: Sequence[Task], jobs: int) -> list[Task]:
-    """Return the tasks, largest input first, each with its share of the processes, at least one.
+    """Return the tasks, largest input first, each with its share of the processes and threads, at least one.
 
     A model gets several where it is more than one process's share of the whole work, and large enough that starting
-    them pays: otherwise whole models side by side keep all processes busy and share nothing.
+    them pays: otherwise whole models side by side keep all processes busy and share nothing. Threads cost nothing to
+    start.
     """
     total = max(1, sum(task.ref.num_bytes for task in tasks))
 
-    def share(task: Task) -> int:
+    def with_share(task: Task) -> Task:
+        num_threads = max(1, jobs * task.ref.num_bytes // total)
+        num_processes = max(1, min(num_threads, task.ref.num_bytes // BYTES_WORTH_A_SHARE))
         if task.limits.memory_bytes is not None:  # a limit holds for one process, not for several that share pages
-            return 1
-        return max(1, min(jobs * task.ref.num_bytes // total, task.ref.num_bytes // BYTES_WORTH_A_SHARE))
+            num_processes = 1
+        return replace(task, num_processes=num_processes, num_threads=num_threads)
 
-    ordered = sorted(tasks, key=lambda task: -task.ref.num_bytes)
-    return [replace(task, num_processes=share(task)) for task in ordered]
+    return [with_share(task) for task in sorted(tasks, key=lambda task: -task.ref.num_bytes)]
+
+
+def _num_at_work(task: Task) -> int:
+    """Return how many processors a task takes: its threads and its processes work in turns."""
+    return max(task.num_threads, task.num_processes)
 
 
 def _call(audit: AuditFunction, task: Task) -> Outcome | Died:

@@ -173,7 +173,7 @@ def _outcomes(
     if dask is not None:
         from sfm_audit.audit.schedule.cluster import in_cluster  # noqa: PLC0415 - imports Dask, which only this needs
 
-        yield from in_cluster([replace(task, num_processes=1) for task in plan], dask, jobs, audit)
+        yield from in_cluster([replace(task, num_processes=1, num_threads=1) for task in plan], dask, jobs, audit)
     elif len(plan) == 1 and plan[0].num_processes == 1 and not is_limited:
         yield from _in_this_process(plan, audit)
     else:

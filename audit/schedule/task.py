@@ -12,6 +12,7 @@ import pyarrow as pa
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.audit.kernels import path_taken
+from sfm_audit.audit.kernels.threads import threads
 from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders import LoadError, ModelRef, open_model
@@ -68,6 +69,7 @@ class Task:
     known_digest: of the input it was last audited with; None when there is no such audit.
     observations: whether to make the table of observations too.
     num_processes: over which its images are spread.
+    num_threads: that compute in each of its kernels, and its joint step beside the rest.
     limits: what its audit may take; enforced from another process.
     """
 
@@ -76,6 +78,7 @@ class Task:
     known_digest: str | None
     observations: bool = False
     num_processes: int = 1
+    num_threads: int = 1
     limits: Limits = NO_LIMITS
 
     @property
@@ -111,7 +114,8 @@ def audit_one(task: Task) -> Outcome:
     start = time.perf_counter()
     ref = task.ref
     paths = {str(path_taken())}
-    with image_processes(task.num_processes, paths) as spread:  # they start while the model is read
+    # processes start while the model is read
+    with threads(task.num_threads), image_processes(task.num_processes, paths) as spread:
         try:
             state = replace(read_input_state(ref.location), evidence=evidence_of(ref, task.config))
             if state.digest == task.known_digest:

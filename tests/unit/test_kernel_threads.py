@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_audit.audit.kernels.threads import num_threads, over_ranges, ranges, threads
+from sfm_audit.audit.kernels.threads import num_threads, over_ranges, ranges, threads, together
 
 
 @given(weights=st.lists(st.integers(0, 90), max_size=40), size=st.sampled_from([1.0, 7.0, 50.0, 1e9]))
@@ -69,6 +69,32 @@ def test_the_first_range_that_fails_is_the_error_and_the_rest_is_left():
     with threads(2), pytest.raises(ValueError, match=r"range 1$"):
         over_ranges(work, 500, range_weight=1.0)
     assert len(begun) < 500
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_two_are_done_together_and_an_error_of_either_is_raised(number):
+    done = []
+    with threads(number):
+        together(lambda: done.append(1), lambda: done.append(2))
+        assert sorted(done) == [1, 2]
+        for calls in ((lambda: done.append(3), lambda: 1 / 0), (lambda: 1 / 0, lambda: done.append(4))):
+            with pytest.raises(ZeroDivisionError):
+                together(*calls)
+    assert 3 in done
+    assert (4 in done) == (number > 1)
+
+
+def test_two_at_the_same_time_wait_for_each_other_and_nobody_waits_after_an_interrupt():
+    both, hold = threading.Barrier(2, timeout=30.0), threading.Event()
+    with threads(2):
+        together(both.wait, both.wait)  # one after the other would wait for ever
+
+        def interrupted():
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            together(interrupted, hold.wait)
+    hold.set()
 
 
 def test_the_caller_s_context_holds_in_the_threads_but_for_their_number():

@@ -16,6 +16,7 @@ from run_samples import make_ref, wait_for, write_models
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor, audit_model
+from sfm_audit.audit.kernels.threads import threads
 from sfm_audit.audit.schedule.images import image_processes, read_shared, write_shared
 from sfm_audit.audit.schedule.lanes import Died, Lanes, RemoteTracebackError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
@@ -48,6 +49,8 @@ def test_a_model_gets_its_share_of_the_processes(sizes, jobs, shares):
     plan = planned(tasks_of(sizes), jobs)
     assert [task.num_processes for task in plan] == shares
     assert [task.ref.num_bytes for task in plan] == sorted(sizes, reverse=True)
+    total = max(1, sum(sizes))
+    assert [task.num_threads for task in plan] == [max(1, jobs * task.ref.num_bytes // total) for task in plan]
     assert sum(share for share in shares if share > 1) <= jobs
 
 
@@ -73,6 +76,15 @@ def check_spread_changes_nothing(location, num_processes, **config):
         assert table.equals(together[name]), name
 
 
+@pytest.mark.parametrize("number", [2, 5])
+def test_threads_change_nothing(scene, number):
+    alone = audited(scene)
+    with threads(number):
+        together = audited(scene)
+    for name, table in alone.items():
+        assert table.equals(together[name]), name
+
+
 @pytest.mark.parametrize("noise", ["track", "constant"])
 def test_images_spread_over_processes_give_the_same_bits(scene, noise):
     check_spread_changes_nothing(scene, 3, noise=noise)
@@ -93,7 +105,7 @@ def test_a_large_model_is_spread_by_the_runner_and_gives_the_same_bits(scene):
     (ref,) = discover([scene]).refs
     task = Task(replace(ref, num_bytes=GB), CONFIG, None)
     (plan,) = planned([task], 2)
-    assert plan.num_processes == 2
+    assert (plan.num_processes, plan.num_threads) == (2, 2)
     ((_, outcome),) = in_processes([plan], 2, audit_one)
     expected = audit_one(task)
     assert isinstance(outcome, Audited)
