@@ -11,6 +11,7 @@ from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 NUM_FEATURES: Final = 40
+NUM_SMOOTH: Final = 28
 MAX_OWN: Final = 32
 """Columns of an image's own fit that the kernels have room for."""
 _DONE: Final = 0
@@ -96,6 +97,11 @@ class Window(NamedTuple):
         """Columns of N: pose, focal lengths, distortion."""
         return 6 + int(self.facts[0]) + int(self.facts[1])
 
+    def only(self, chosen: IntArray) -> Window:
+        """Return some of the images."""
+        extra = tuple(self.d_extra[b] for b in chosen.tolist())
+        return Window(self.rows[chosen], self.numbers[chosen], self.facts, extra)
+
 
 def misfit_sums(observed: Observed, window: Window) -> tuple[FloatArray, FloatArray] | None:
     """Return Gram matrices (k, q + 40, q + 40) of N and features, and products with the residuals (k, q + 40).
@@ -132,6 +138,35 @@ def misfit_meat(
     num_clusters = np.zeros(num, dtype=np.int64)
     status = function(*_arguments(observed, window), basis, on_y, meat, leverage, num_clusters)
     return (meat, leverage, num_clusters) if status == _DONE else None
+
+
+def misfit_mixed(
+    observed: Observed,
+    window: Window,
+    profile: tuple[FloatArray, FloatArray],
+    mixing: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return Gram matrices (k, 28, 28), scores (k, 28) and meat (k, 28, 28) of smooth fields, mixed and off N.
+
+    None where numpy is to be taken.
+
+    Parameters
+    ----------
+    profile : basis (k, q, q) and on_y (k, q) as of `misfit_meat`
+    mixing : mix (k, 28, 28) and coefficients (k, q, 28): the columns are monomials mix - N coefficients
+    """
+    function = kernel("sfm_misfit_mixed", *_WINDOW, *[Doubles] * 7)
+    if function is None or window.num_own > MAX_OWN:
+        return None
+    num, q = len(window.rows), window.num_own
+    (basis, on_y), (mix, coefficients) = profile, mixing
+    _check("basis", basis, (num, q, q))
+    _check("on_y", on_y, (num, q))
+    _check("mix", mix, (num, NUM_SMOOTH, NUM_SMOOTH))
+    _check("coefficients", coefficients, (num, q, NUM_SMOOTH))
+    gram, scores, meat = (np.zeros((num, NUM_SMOOTH, *rest)) for rest in ((NUM_SMOOTH,), (), (NUM_SMOOTH,)))
+    status = function(*_arguments(observed, window), basis, on_y, mix, coefficients, gram, scores, meat)
+    return (gram, scores, meat) if status == _DONE else None
 
 
 class Tracks(NamedTuple):

@@ -141,8 +141,16 @@ def sums_of(features: ImageFeatures) -> tuple[FloatArray, FloatArray]:
     return gram, on_y
 
 
-def weights_of(features: ImageFeatures, to_basis: FloatArray, on_y: FloatArray) -> tuple[FloatArray, float]:
-    """Return (y - N c) / sqrt(1 - h), (2, n), and the largest h, the squared length of what ``to_basis`` N says.
+class Weights(NamedTuple):
+    """left: (2, n) y - N c.    weights: (2, n) left / sqrt(1 - h).    leverage: the largest h."""
+
+    left: FloatArray
+    weights: FloatArray
+    leverage: float
+
+
+def weights_of(features: ImageFeatures, to_basis: FloatArray, on_y: FloatArray) -> Weights:
+    """Return residuals off N, weighted by their leverage h, the squared length of what ``to_basis`` N says.
 
     Parameters
     ----------
@@ -154,7 +162,16 @@ def weights_of(features: ImageFeatures, to_basis: FloatArray, on_y: FloatArray) 
     leverage = np.einsum("rm,rm->m", along, along)
     left = y - on_y @ flat
     weights = left / np.sqrt(1.0 - np.minimum(leverage, basis.MAX_LEVERAGE))
-    return weights.reshape(2, n), float(leverage.max(initial=0.0))
+    return Weights(left.reshape(2, n), weights.reshape(2, n), float(leverage.max(initial=0.0)))
+
+
+def mixed_of(features: ImageFeatures, mix: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Return (28, 2, n) smooth fields, mixed and off N: monomials mix - N coefficients, mix (28, 28), (q, 28)."""
+    q, half = features.num_own, NUM_MONOMIALS - 1
+    out = np.empty((2 * half, 2, features.rows.shape[2]))
+    for axis, own in enumerate((mix[:half], mix[half:])):
+        out[:, axis] = own.T @ features.monomials[1:] - coefficients.T @ features.rows[:q, axis]
+    return out
 
 
 def scores_of(features: ImageFeatures, weights: FloatArray) -> FloatArray:

@@ -6,17 +6,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit.features import widened, widened_columns
+from sfm_audit.audit.misfit.mixed import smooth_tests
 from sfm_audit.audit.misfit.outcome import MisfitTests
 from sfm_audit.audit.misfit.stacked import Sizes, profiled, tests_of_stack
 from sfm_audit.audit.misfit.sums import ModelSums, WindowSums
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import SparseModel
+
+_ALL: Final = frozenset(GROUPS)
+_NOT_SMOOTH: Final = _ALL - {MisfitGroup.SMOOTH}
 
 
 class TestedImage(NamedTuple):
@@ -48,8 +54,15 @@ def _tested(window: WindowSums) -> dict[int, TestedImage]:
     meat, leverage, num_clusters = window.meat(found.to_basis, found.on_y)
     sizes = Sizes(window.num_observations, num_clusters)
     tests = tests_of_stack(found, widened(meat, window.offset, q), leverage, sizes)
+    lacking = [b for b, own in enumerate(tests) if own is not None and _NOT_SMOOTH <= own.keys() < _ALL]
+    if lacking:
+        images = np.array(lacking, dtype=np.int64)
+        mixed = partial(window.mixed, found.to_basis, found.on_y)
+        for b, test in zip(lacking, smooth_tests(found, images, q, mixed, sizes), strict=True):
+            if test is not None:
+                tests[b] = {**(tests[b] or {}), MisfitGroup.SMOOTH: test}
     return {
-        image: TestedImage(test, own[:q, :q].copy())
+        image: TestedImage({group: test[group] for group in GROUPS}, own[:q, :q].copy())
         for image, test, own in zip(window.images, tests, gram, strict=True)
-        if test is not None
+        if test is not None and test.keys() == _ALL
     }

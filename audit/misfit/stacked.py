@@ -18,12 +18,13 @@ from scipy import special
 from sfm_audit.audit.misfit import basis
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
 from sfm_audit.audit.misfit.outcome import SINGULAR_MEAT, MisfitTest, MisfitTests, not_tested, refusal
-from sfm_audit.audit.table.words import MisfitStatus
+from sfm_audit.audit.table.words import MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 SMALLEST_PIVOT: Final = 1e-7  # of N's Gram matrix, unit columns
 SURE_NULL: Final = 1e-13  # squared singular values of unit fields below it are rounding, those above may count
 LOST_DIGITS: Final = 1e-6  # largest rounding of a squared singular value that is kept, as a share of it
+LOST_OF_SMOOTH: Final = 1e-8  # the same where `audit.misfit.mixed` has more
 _SURE_MEAT: Final = 1e3 * SINGULAR_MEAT
 _EPSILON: Final = float(np.finfo(np.float64).eps)
 _MAX_LEVERAGE: Final = 0.999
@@ -103,7 +104,9 @@ class Sizes:
 
 
 def tests_of_stack(found: Profiled, meat: FloatArray, leverage: FloatArray, sizes: Sizes) -> list[MisfitTests | None]:
-    """Return the score tests of B images; None where `audit.misfit.score.prepare` has to say.
+    """Return the score tests of B images, without those of groups of which the rank or the digits are in doubt.
+
+    None where none of an image's numbers hold.
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def tests_of_stack(found: Profiled, meat: FloatArray, leverage: FloatArray, size
                 test = not_tested(MisfitStatus.NOT_ENOUGH_EVIDENCE)
             if test is not None:
                 tests[group] = test
-        out.append(tests if is_sure and len(tests) == len(GROUP_COLUMNS) else None)
+        out.append(tests if is_sure else None)
     return out
 
 
@@ -133,7 +136,8 @@ def _group_tests(
 ) -> list[MisfitTest | None]:
     """One group in all images."""
     values, vectors = np.linalg.eigh(found.left[:, columns, columns])
-    ranks, certain = ranks_of(values, found.coefficients[:, :, columns] @ vectors)
+    lost = LOST_OF_SMOOTH if columns == GROUP_COLUMNS[MisfitGroup.SMOOTH] else LOST_DIGITS
+    ranks, certain = ranks_of(values, found.coefficients[:, :, columns] @ vectors, lost)
     certain &= sure
     out: list[MisfitTest | None] = [None] * len(values)
     for rank in np.unique(ranks[certain]).tolist():
@@ -155,16 +159,17 @@ def _group_tests(
     return out
 
 
-def ranks_of(values: FloatArray, along: FloatArray) -> tuple[IntArray, BoolArray]:
+def ranks_of(values: FloatArray, along: FloatArray, lost: float = LOST_DIGITS) -> tuple[IntArray, BoolArray]:
     """Return ranks (B,) by squared singular values (B, c), ascending, of unit fields off N, and which are certain.
 
     Parameters
     ----------
     along : (B, q, c) what each singular direction was of N's unit columns: so much was subtracted for its value
+    lost : share of a value that rounding may be
     """
     kept = values > SURE_NULL
     rounding = _EPSILON * (1.0 + np.einsum("bqc,bqc->bc", along, along))
-    certain = (~kept | (rounding <= LOST_DIGITS * values)).all(axis=1)
+    certain = (~kept | (rounding <= lost * values)).all(axis=1)
     return np.asarray(kept.sum(axis=1)), np.asarray(certain)
 
 

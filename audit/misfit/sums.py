@@ -19,6 +19,7 @@ from sfm_audit.audit.kernels.misfit import (
     Tracks,
     Window,
     misfit_meat,
+    misfit_mixed,
     misfit_sums,
     misfit_tracks,
 )
@@ -27,6 +28,7 @@ from sfm_audit.audit.misfit.features import (
     ImageFeatures,
     affine_offset,
     image_features,
+    mixed_of,
     scores_of,
     sums_of,
     weights_of,
@@ -203,14 +205,44 @@ class WindowSums:
         meat, leverage = np.zeros((len(self.images), size, size)), np.zeros(len(self.images))
         num_clusters = self.num_observations.copy()
         for b, features in enumerate(self._features):
-            weights, leverage[b] = weights_of(features, basis[b], on_y[b])
+            _, weights, leverage[b] = weights_of(features, basis[b], on_y[b])
             g = scores_of(features, weights)
-            clusters = Clusters.of(pixels(self._source.keypoints(self.images[b])))
+            clusters = self._clusters(b)
             if clusters is not None:
                 num_clusters[b] -= clusters.num_merged
                 clusters.merge(g)
             meat[b] = g @ g.T
         return meat, leverage, num_clusters
+
+    def mixed(
+        self, basis: FloatArray, on_y: FloatArray, chosen: IntArray, mix: FloatArray, coefficients: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return Gram matrices (k, 28, 28), scores (k, 28) and meat (k, 28, 28) of `mixed_of` chosen images (k,).
+
+        Parameters
+        ----------
+        basis, on_y : of all images, as in `meat`        mix : (k, 28, 28)        coefficients : (k, q, 28)
+        """
+        if self._window is not None:
+            profile = basis[chosen], on_y[chosen]
+            found = misfit_mixed(self._source.observed, self._window.only(chosen), profile, (mix, coefficients))
+            if found is not None:
+                return found
+        gram, scores, meat = np.empty_like(mix), np.empty(mix.shape[:2]), np.empty_like(mix)
+        for place, b in enumerate(chosen.tolist()):
+            left, weights, _ = weights_of(self._features[b], basis[b], on_y[b])
+            columns = mixed_of(self._features[b], mix[place], coefficients[place])
+            flat = columns.reshape(len(columns), -1)
+            gram[place], scores[place] = flat @ flat.T, flat @ left.reshape(-1)
+            g = np.asarray(np.einsum("cin,in->cn", columns, weights))
+            clusters = self._clusters(b)
+            if clusters is not None:
+                clusters.merge(g)
+            meat[place] = g @ g.T
+        return gram, scores, meat
+
+    def _clusters(self, b: int) -> Clusters | None:
+        return Clusters.of(pixels(self._source.keypoints(self.images[b])))
 
     def add_tracks(
         self, per_track: FloatArray, profile: tuple[FloatArray, FloatArray, FloatArray], tracks: Tracks
@@ -228,8 +260,7 @@ class WindowSums:
         last_row = np.empty(len(per_track), dtype=np.int64)
         for b, features in enumerate(self._features):
             basis, on_y, coefficients = (each[b] for each in profile)
-            weights, _ = weights_of(features, basis, on_y)
-            g = scores_of(features, weights)
+            g = scores_of(features, weights_of(features, basis, on_y).weights)
             own = g[self.num_own :] - coefficients.T @ g[: self.num_own]
             track = tracks.of_point[self._source.points(self.images[b])]
             inside = (track >= tracks.first) & (track < tracks.last)

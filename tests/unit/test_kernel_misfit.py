@@ -19,15 +19,18 @@ from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, Tracks, misfit_sums, misfit_tracks
 from sfm_audit.audit.misfit import (
     GROUPS,
+    MisfitGroup,
     MisfitStatus,
     camera_sums,
     camera_tests,
     candidate_fields,
     coincident_keypoints,
+    mixed,
     nuisance_columns,
     prepare,
     projected_design,
 )
+from sfm_audit.audit.misfit import images as images_module
 from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.features import affine_offset, image_features, sums_of, widened, widened_columns
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
@@ -180,14 +183,60 @@ def test_the_unit_of_the_world_does_not_matter(tmp_path, scale):
         assert_same(own.tests, expected[image].tests)
 
 
-def test_images_in_doubt_are_left_out(tmp_path):
-    """With next to no distortion its column almost is a polynomial of the predicted point, which is a smooth field."""
-    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (200, 150), centre=(320.0, 240.0))
+def nearly_flat(folder, numbers, k1, **options):
+    """With next to no distortion its column nearly is a polynomial of the predicted point, which is a smooth field."""
+    model, _ = model_of(folder, "SIMPLE_RADIAL", numbers, centre=(320.0, 240.0), **options)
     params = model.cameras.params.copy()
-    params[3::4] = 1e-5
-    flat = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
-    assert len(misfit_of_images(model, residuals, [0, 1])) == 2
-    assert not misfit_of_images(flat, model_residuals(flat), [0, 1])
+    params[3::4] = k1
+    model = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
+    return model, model_residuals(model)
+
+
+@pytest.mark.parametrize("path", [pytest.param("compiled", marks=compiled), "numpy"])
+@pytest.mark.parametrize("k1", [0.0, 1e-5, 1e-4, 1e-3])
+def test_smooth_fields_that_nearly_are_absorbed_keep_their_digits(tmp_path, monkeypatch, k1, path):
+    model, residuals = nearly_flat(tmp_path, (300, 130, 90), k1, twins=20)
+    asked = []
+    monkeypatch.setattr(images_module, "smooth_tests", lambda *a: asked.append(a[1]) or mixed.smooth_tests(*a))
+    if path == "numpy":
+        with numpy_only():
+            found = misfit_of_images(model, residuals, [0, 1, 2])
+    else:
+        found = misfit_of_images(model, residuals, [0, 1, 2])
+    assert sorted(found) == [0, 1, 2]
+    assert bool(asked) == (k1 > 0)
+    for image, own in found.items():
+        assert_same(own.tests, alone(model, residuals, image)[1])
+        assert own.tests[MisfitGroup.SMOOTH].rank == (26 if k1 >= 1e-4 else 25)
+
+
+@compiled
+def test_mixed_sums_are_those_of_numpy(tmp_path):
+    model, residuals = model_of(tmp_path, "OPENCV", (300, 130, 70), twins=20)
+    rng = np.random.default_rng(4)
+    chosen, q = np.array([0, 2]), 12
+    basis, on_y = rng.normal(size=(3, q, q)) * 1e-6, rng.normal(size=(3, q)) * 1e-4
+    mixing = chosen, rng.normal(size=(2, 28, 28)), rng.normal(size=(2, q, 28)) * 1e-2
+    found = window_of(model, residuals).mixed(basis, on_y, *mixing)
+    with numpy_only():
+        expected = window_of(model, residuals).mixed(basis, on_y, *mixing)
+    for one, other in zip(found, expected, strict=True):
+        assert_close(one, other)
+    with pytest.raises(ValueError, match="mix of shape"):
+        window_of(model, residuals).mixed(basis, on_y, chosen, mixing[1][:, 1:].copy(), mixing[2])
+
+
+def test_ranks_near_the_threshold_stay_in_doubt():
+    values = np.array([[0.5, 2.0], [0.95, 2.0], [1.05, 2.0], [0.1, 0.2]])
+    ranks, certain = mixed._ranks_of(values, np.ones(4))
+    assert ranks.tolist() == [1, 1, 2, 0]
+    assert certain.tolist() == [True, False, False, False]
+
+
+def test_images_in_doubt_are_left_out(tmp_path):
+    """The numerator and the denominator of FULL_OPENCV can hardly be told apart where both are small."""
+    model, residuals = model_of(tmp_path, "FULL_OPENCV", (200, 150))
+    assert not misfit_of_images(model, residuals, [0, 1])
 
 
 def test_panoramas_and_empty_images_have_no_sums(tmp_path):
@@ -316,11 +365,8 @@ def test_shared_cameras_in_doubt_are_left_out(tmp_path):
     assert camera_tests_of_sums(model, residuals, []) is None
     model, residuals = model_of(tmp_path / "small", "SIMPLE_RADIAL", (60, 60), shared=True)
     assert camera_tests_of_sums(model, residuals, [0, 1]) is None
-    model, residuals = model_of(tmp_path / "flat", "SIMPLE_RADIAL", (200, 150), shared=True, centre=(320.0, 240.0))
-    params = model.cameras.params.copy()
-    params[3::4] = 1e-5
-    flat = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
-    assert camera_tests_of_sums(flat, model_residuals(flat), [0, 1]) is None
+    flat, residuals = nearly_flat(tmp_path / "flat", (200, 150), 1e-5, shared=True)
+    assert camera_tests_of_sums(flat, residuals, [0, 1]) is None
 
 
 @compiled

@@ -36,9 +36,9 @@ typedef struct {
     int64_t rows[SIZE];
 } block_t;
 
-/* What stands for an observation in the meat: rows N w, S w, R w, m w_x, m w_y; moments of w_x^2, w_x w_y, w_y^2. */
+/* What stands for an observation in the meat: rows N w, S w, R w, m w_x, m w_y; moments of w_x^2, w_x w_y, w_y^2.   left: y - N c. */
 typedef struct {
-    row_t g[MAX_FEATURES], squares[3 * MONOMIALS], w[2];
+    row_t g[MAX_FEATURES], squares[3 * MONOMIALS], w[2], left[2];
     double largest_leverage;
 } scores_t;
 
@@ -330,6 +330,7 @@ static WIDE void weigh(const block_t *b, int q, const double *basis, int num, co
         memcpy(s->w[axis], own[q], sizeof(row_t));
         for (int j = 0; j < q; ++j)
             for (int k = 0; k < SIZE; ++k) s->w[axis][k] -= c[j] * own[j][k];
+        memcpy(s->left[axis], s->w[axis], sizeof(row_t));
         for (int k = 0; k < SIZE; ++k)
             s->w[axis][k] /= sqrt(1.0 - (leverage[k] < MAX_LEVERAGE ? leverage[k] : MAX_LEVERAGE));
     }
@@ -405,7 +406,7 @@ static void write_meat(const meat_t *meat, int q, double *out) {
  * are there.   members: those of pixels of two and more, pixel by pixel. */
 typedef struct {
     int64_t *head, *size, *members, *table, *column, *row;
-    int64_t capacity, num_members, num_clusters;
+    int64_t capacity, num_members, num_clusters, num_probes;
     void *memory;
 } clusters_t;
 
@@ -425,6 +426,7 @@ static int64_t first_of_pixel(clusters_t *c, int64_t i, int64_t capacity) {
     hash *= 0xD6E8FEB86659FD93u;
     for (int64_t slot = (int64_t)((hash >> 32) & (uint64_t)(capacity - 1));; slot = (slot + 1) & (capacity - 1)) {
         const int64_t other = c->table[slot];
+        c->num_probes += 1;
         if (other < 0) return c->table[slot] = i;
         if (c->column[other] == c->column[i] && c->row[other] == c->row[i]) return other;
     }
@@ -435,13 +437,14 @@ static int find_clusters(const model_t *model, const image_t *image, clusters_t 
     int64_t capacity = 16, placed = 0;
     while (capacity < 2 * num) capacity *= 2;
     memset(c->table, -1, sizeof(int64_t) * (size_t)capacity);
-    c->num_clusters = 0;
+    c->num_clusters = c->num_probes = 0;
     for (int64_t i = 0; i < num; ++i) {
         const double *seen = model->xy_px + 2 * model->observation[image->start + i];
         if (!(fabs(seen[0]) < 1e15 && fabs(seen[1]) < 1e15)) return NEEDS_NUMPY;
         c->column[i] = (int64_t)floor(seen[0]), c->row[i] = (int64_t)floor(seen[1]), c->size[i] = 0;
         c->head[i] = first_of_pixel(c, i, capacity);
         c->size[c->head[i]] += 1, c->num_clusters += c->head[i] == i;
+        if (c->num_probes > 64 * num) return NEEDS_NUMPY; /* pixels made to meet in the table */
     }
     for (int64_t i = 0; i < num; ++i) /* column: where the pixel's next member goes */
         if (c->head[i] == i && c->size[i] > 1) c->column[i] = placed, placed += c->size[i];
@@ -526,6 +529,117 @@ KERNEL int64_t sfm_misfit_meat(WINDOW, const double *basis, const double *on_y, 
     }
     free(to_free), free(clusters.memory);
     return DONE;
+}
+
+/* The smooth fields once more, mixed and projected before they are summed up: u = m mix - N coefficients, along x and y. */
+enum { SMOOTH = 2 * (MONOMIALS - 1) };
+typedef struct {
+    row_t u[2][SMOOTH], g[SMOOTH], clusters[SMOOTH];
+    double gram[SMOOTH * SMOOTH], on_y[SMOOTH], meat[SMOOTH * SMOOTH];
+} mixed_t;
+
+typedef struct {
+    scratch_t common;
+    mixed_t mixed;
+} mixed_scratch_t;
+
+static WIDE void mix_fields(const block_t *b, int q, const double *mix, const double *coefficients, scores_t *s, mixed_t *out) {
+    for (int axis = 0; axis < 2; ++axis) {
+        const row_t *own = axis ? b->y : b->x;
+        const double *factors = mix + axis * (MONOMIALS - 1) * SMOOTH;
+        for (int k = 0; k < SIZE; k += 8)
+            for (int j = 0; j < SMOOTH; ++j) {
+                lanes left = {0}, right = {0};
+                for (int i = 0; i < MONOMIALS - 1; ++i) {
+                    const double factor = factors[i * SMOOTH + j];
+                    left += factor * *(const lanes *)&b->m[i + 1][k], right += factor * *(const lanes *)&b->m[i + 1][k + 4];
+                }
+                for (int i = 0; i < q; ++i) {
+                    const double factor = coefficients[i * SMOOTH + j];
+                    left -= factor * *(const lanes *)&own[i][k], right -= factor * *(const lanes *)&own[i][k + 4];
+                }
+                *(lanes *)&out->u[axis][j][k] = left, *(lanes *)&out->u[axis][j][k + 4] = right;
+            }
+    }
+    for (int j = 0; j < SMOOTH; ++j)
+        for (int k = 0; k < SIZE; ++k) out->g[j][k] = out->u[0][j][k] * s->w[0][k] + out->u[1][j][k] * s->w[1][k];
+}
+
+typedef struct {
+    const double *mix, *coefficients;
+} mixing_t;
+
+static void mixed_block(const model_t *model, const image_t *image, const profile_t *profile, const mixing_t *mixing,
+                        int count, mixed_scratch_t *scratch, const clusters_t *alone) {
+    const int q = own_columns(model->facts);
+    block_t *b = &scratch->common.block;
+    scores_t *s = &scratch->common.scores;
+    evaluate(model, image, count, b);
+    weigh(b, q, profile->basis, profile->num, profile->on_y, s);
+    for (int k = 0; alone && k < count; ++k)
+        if (alone->size[alone->head[b->rows[k] - image->start]] > 1) s->w[0][k] = s->w[1][k] = 0.0;
+    mix_fields(b, q, mixing->mix, mixing->coefficients, s, &scratch->mixed);
+}
+
+static void add_mixed(const model_t *model, const image_t *image, const profile_t *profile, const mixing_t *mixing,
+                      const clusters_t *c, mixed_scratch_t *scratch) {
+    block_t *b = &scratch->common.block;
+    mixed_t *m = &scratch->mixed;
+    for (int64_t from = image->start; from < image->stop; from += SIZE) {
+        mixed_block(model, image, profile, mixing, fill_rows(from, image->stop, b), scratch, c);
+        for (int axis = 0; axis < 2; ++axis) {
+            const row_t *u = (const row_t *)m->u[axis];
+            products(u, SMOOTH, u, SMOOTH, m->gram, SMOOTH);
+            products((const row_t *)scratch->common.scores.left + axis, 1, u, SMOOTH, m->on_y, SMOOTH);
+        }
+        products((const row_t *)m->g, SMOOTH, (const row_t *)m->g, SMOOTH, m->meat, SMOOTH);
+    }
+    int at = -1;
+    for (int64_t from = 0; from < c->num_members; from += SIZE) {
+        const int count = fill_rows(from, c->num_members, b);
+        for (int k = 0; k < count; ++k) b->rows[k] = image->start + c->members[from + k];
+        mixed_block(model, image, profile, mixing, count, scratch, NULL);
+        for (int k = 0; k < count; ++k) {
+            const int starts = c->head[c->members[from + k]] == c->members[from + k];
+            if (starts && at == SIZE - 1) {
+                products((const row_t *)m->clusters, SMOOTH, (const row_t *)m->clusters, SMOOTH, m->meat, SMOOTH);
+                at = -1;
+            }
+            at += starts;
+            for (int j = 0; j < SMOOTH; ++j) m->clusters[j][at] = m->g[j][k] + (starts ? 0.0 : m->clusters[j][at]);
+        }
+    }
+    for (int j = 0; at >= 0 && j < SMOOTH; ++j)
+        for (int k = at + 1; k < SIZE; ++k) m->clusters[j][k] = 0.0;
+    if (at >= 0) products((const row_t *)m->clusters, SMOOTH, (const row_t *)m->clusters, SMOOTH, m->meat, SMOOTH);
+}
+
+/* The smooth fields of images whose digits do not last in plain sums: Gram matrix, products with y - N c, meat. */
+KERNEL int64_t sfm_misfit_mixed(WINDOW, const double *basis, const double *on_y, const double *mix,
+                                const double *coefficients, double *gram, double *scores, double *meat) {
+    const model_t model = MODEL;
+    const int q = own_columns(facts);
+    int64_t longest = 1;
+    for (int64_t i = 0; i < num_images; ++i)
+        if (rows[2 * i + 1] - rows[2 * i] > longest) longest = rows[2 * i + 1] - rows[2 * i];
+    void *to_free;
+    clusters_t clusters;
+    mixed_scratch_t *scratch = aligned_scratch(sizeof(mixed_scratch_t), &to_free);
+    int status = make_clusters(longest, &clusters);
+    if (!scratch || q > MAX_OWN) status = q > MAX_OWN ? NEEDS_NUMPY : NO_MEMORY;
+    for (int64_t i = 0; status == DONE && i < num_images; ++i) {
+        const image_t image = IMAGE(i);
+        const profile_t profile = {basis + i * q * q, on_y + i * q, q};
+        const mixing_t mixing = {mix + i * SMOOTH * SMOOTH, coefficients + i * q * SMOOTH};
+        mixed_t *m = &scratch->mixed;
+        status = find_clusters(&model, &image, &clusters);
+        memset(m->gram, 0, sizeof m->gram), memset(m->on_y, 0, sizeof m->on_y), memset(m->meat, 0, sizeof m->meat);
+        if (status == DONE) add_mixed(&model, &image, &profile, &mixing, &clusters, scratch);
+        memcpy(gram + i * SMOOTH * SMOOTH, m->gram, sizeof m->gram);
+        memcpy(scores + i * SMOOTH, m->on_y, sizeof m->on_y), memcpy(meat + i * SMOOTH * SMOOTH, m->meat, sizeof m->meat);
+    }
+    free(to_free), free(clusters.memory);
+    return status;
 }
 
 /* g minus what the profile explains of it: g_j -= sum_i coefficients (q, 40) of (N w)_i. */
