@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.table.arrow import Column
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _COLUMNS: Final = ("rms_px", "mean_px", "median_px", "p95_px", "max_px")
 _FEW: Final = 64
@@ -37,31 +37,38 @@ class ErrorSummary:
 def error_summary(residuals: ModelResiduals, image_idxs: range) -> ErrorSummary:
     """Sum up the reprojection errors of some images of a model."""
     offsets = residuals.offsets[image_idxs.start : image_idxs.stop + 1]
-    first, last = int(offsets[0]), int(offsets[-1])
-    x, y = residuals.residuals_px[:, first:last]
+    x, y = residuals.residuals_px[:, int(offsets[0]) : int(offsets[-1])]
     sq = x * x + y * y
-    starts, counts = offsets[:-1] - first, np.diff(offsets)
+    starts, counts = offsets[:-1] - offsets[0], np.diff(offsets)
+    stacks = [_stack(starts, counts, size) for size in np.unique(counts[(counts > 0) & (counts <= _FEW)]).tolist()]
+    many = [(row, slice(starts[row], starts[row] + counts[row])) for row in np.flatnonzero(counts > _FEW).tolist()]
+    error = sq.copy()
+    for _, columns in stacks:
+        error[columns] = np.sort(sq[columns], axis=1)
+    for _, own in many:
+        error[own].sort()
+    np.sqrt(error, out=error)
     out = np.full((len(counts), len(_COLUMNS)), math.nan)
-    for size in np.unique(counts[(counts > 0) & (counts <= _FEW)]).tolist():
-        rows = np.flatnonzero(counts == size)
-        out[rows] = _summaries(sq[starts[rows][:, None] + np.arange(size)])
-    for row in np.flatnonzero(counts > _FEW).tolist():
-        out[row] = _summaries(sq[starts[row] : starts[row] + counts[row]][None])[0]
+    for rows, columns in stacks:
+        out[rows, 0], out[rows, 1] = np.sqrt(sq[columns].mean(axis=1)), error[columns].mean(axis=1)
+    for row, own in many:
+        out[row, 0] = math.sqrt(np.add.reduce(sq[own]) / counts[row])
+        out[row, 1] = np.add.reduce(error[own]) / counts[row]
+    asked = counts > 0
+    for place, q in ((2, 0.5), (3, 0.95), (4, 1.0)):
+        out[asked, place] = _quantiles(error, starts[asked], counts[asked], q)
     return ErrorSummary(out)
 
 
-def _summaries(sq: FloatArray) -> FloatArray:
-    """Return the five numbers of each row of squares (B, m)."""
-    error = np.sqrt(np.sort(sq, axis=1))
-    return np.stack(
-        [np.sqrt(sq.mean(axis=1)), error.mean(axis=1), _quantile(error, 0.5), _quantile(error, 0.95), error[:, -1]],
-        axis=1,
-    )
+def _stack(starts: IntArray, counts: IntArray, size: int) -> tuple[IntArray, IntArray]:
+    """Return the images with so many inliers, and the columns of each, a row of (B, size)."""
+    rows = np.flatnonzero(counts == size)
+    return rows, starts[rows][:, None] + np.arange(size)
 
 
-def _quantile(ascending: FloatArray, q: float) -> FloatArray:
-    """Linear interpolation between order statistics, as numpy.quantile's default, of each row."""
-    position = q * (ascending.shape[1] - 1)
-    low = int(position)
-    high = min(low + 1, ascending.shape[1] - 1)
-    return np.asarray(ascending[:, low] + (position - low) * (ascending[:, high] - ascending[:, low]))
+def _quantiles(ascending: FloatArray, starts: IntArray, counts: IntArray, q: float) -> FloatArray:
+    """Linear interpolation between order statistics, as numpy.quantile's default, of parts of a column."""
+    position = q * (counts - 1)
+    low = position.astype(np.int64)
+    below, above = ascending[starts + low], ascending[starts + np.minimum(low + 1, counts - 1)]
+    return np.asarray(below + (position - low) * (above - below))

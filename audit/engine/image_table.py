@@ -10,13 +10,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfm_audit.audit.camera_quality.measure import CameraQuality
+from sfm_audit.audit.camera_quality.identifiability import ParameterCovariance, fitted_names
+from sfm_audit.audit.camera_quality.measure import CameraQuality, expected_errors_px
 from sfm_audit.audit.decision.columns import decision_columns
 from sfm_audit.audit.decision.decisions import Decisions
 from sfm_audit.audit.decision.diagnostics import OwnDiagnostics
 from sfm_audit.audit.decision.measured import STATUSES, Measured, MeasuredMisfit
 from sfm_audit.audit.engine.error_summary import ErrorSummary
-from sfm_audit.audit.engine.jointly import expected_error_px, pose_columns
+from sfm_audit.audit.engine.jointly import pose_columns
 from sfm_audit.audit.engine.known import ModelFacts, sizes_px
 from sfm_audit.audit.engine.noise_columns import NoiseColumns
 from sfm_audit.audit.table import ModelLabels
@@ -209,11 +210,9 @@ def _camera_columns(known: KnownImages) -> dict[str, Column]:
     columns = dict(zip(_OF_QUALITY, numbers.T, strict=True))
     sd_focal_px, error_px = columns["sd_focal_px_conditional"].copy(), columns["expected_error_px_conditional"].copy()
     has_camera = known.facts.model.images.camera_idx[known.images] >= 0
-    joint = np.flatnonzero(camera.is_joint)
-    for row in joint.tolist():
-        error_px[row] = _joint_error_px(known, row)
-        if camera.has_focal[row]:
-            sd_focal_px[row] = _sd_of_first_focal(known.measured.own.records[row], qualities[row])
+    error_px = np.where(camera.is_joint, _joint_errors_px(known), error_px)
+    for row in np.flatnonzero(camera.is_joint & camera.has_focal).tolist():
+        sd_focal_px[row] = _sd_of_first_focal(known.measured.own.records[row], qualities[row])
     return {
         **columns,
         "coverage": np.where(camera.known, camera.coverage, np.where(has_camera, 0.0, math.nan)),
@@ -229,11 +228,24 @@ def _camera_columns(known: KnownImages) -> dict[str, Column]:
     }
 
 
-def _joint_error_px(known: KnownImages, row: int) -> float:
-    quality, joint, image_idx = known.qualities[row], known.facts.joint, known.image_idxs[row]
-    if quality is None or joint is None:
-        return math.nan
-    return expected_error_px(quality, joint.covariances[image_idx], float(known.facts.sigma_constant_px[image_idx]))
+def _joint_errors_px(known: KnownImages) -> FloatArray:
+    """(n,) expected errors of a measurement from the joint covariances of poses and own parameters; else NaN."""
+    errors_px, joint = np.full(len(known), math.nan), known.facts.joint
+    asked = [
+        (row, quality, joint.covariances[known.image_idxs[row]])
+        for row, quality in enumerate(known.qualities)
+        if joint is not None and quality is not None and known.measured.camera.is_joint[row]
+    ]
+    asked = [each for each in asked if each[2].size and math.isfinite(each[2].sum())]
+    if asked:
+        rows, qualities, covariances = zip(*asked, strict=True)
+        shapes = [quality.shape for quality in qualities]
+        named = zip(shapes, covariances, strict=True)
+        parameters = [ParameterCovariance(fitted_names(shape.camera.model), own, 1.0) for shape, own in named]
+        sigma_px = known.facts.sigma_constant_px[known.images[list(rows)]]
+        depth = np.array([quality.median_depth for quality in qualities])
+        errors_px[list(rows)] = expected_errors_px(shapes, parameters, sigma_px, depth)
+    return errors_px
 
 
 def _sd_of_first_focal(own: OwnDiagnostics | None, quality: CameraQuality | None) -> float:

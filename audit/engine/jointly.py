@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from sfm_audit.audit.decision.diagnostics import (
 )
 from sfm_audit.audit.joint import CameraStep, Implied, ImpliedParameter, JointAudit, JointTest
 from sfm_audit.audit.table.words import GROUPS, MisfitStatus
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 NO_TEST = GroupDiagnostics(math.nan, math.nan, -math.inf, MisfitStatus.NO_COLUMNS)
 """A group of an image that takes no part in the joint system."""
@@ -117,7 +118,13 @@ def pose_columns(joint: JointAudit, image_idx: int, names: Sequence[str]) -> dic
 
 def below_diagonal(correlation: FloatArray) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
     """Return the values below the diagonal of (q, q), row by row; masked where they are not known."""
-    return np.ma.masked_invalid(correlation[np.tril_indices(len(correlation), -1)])
+    values = correlation[_below_diagonal(len(correlation))]
+    return np.ma.masked_array(values, ~np.isfinite(values))
+
+
+@lru_cache(maxsize=64)
+def _below_diagonal(size: int) -> tuple[IntArray, IntArray]:
+    return np.tril_indices(size, -1)
 
 
 _IMPLIED_COLUMNS: Final[dict[Implied, tuple[str, ...]]] = {

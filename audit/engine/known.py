@@ -25,7 +25,7 @@ from sfm_audit.audit.decision.measured import (
     MeasuredParts,
 )
 from sfm_audit.audit.engine.image import unusable_reason
-from sfm_audit.audit.engine.jointly import consistency_diagnostics, own_diagnostics
+from sfm_audit.audit.engine.jointly import consistency_diagnostics
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.inliers.sanity import is_sane, is_usable
 from sfm_audit.audit.joint import CameraStep, JointAudit
@@ -61,6 +61,8 @@ class ModelFacts(Protocol):
     def joint(self) -> JointAudit | None: ...  # noqa: D102
     @property
     def steps(self) -> dict[int, CameraStep]: ...  # noqa: D102
+    @property
+    def own(self) -> Mapping[int, OwnDiagnostics]: ...  # noqa: D102
     @property
     def implied(self) -> Mapping[int, Mapping[str, float]]: ...  # noqa: D102
     @property
@@ -99,7 +101,7 @@ def measured_of(facts: ModelFacts, image_idxs: range, noise: MeasuredNoise, larg
         unusable=_unusable(model, image_idxs),
         remarks={},
         parts=_parts(consistency, image_idxs),
-        own=_own(model, images, known, steps),
+        own=_own(facts, images, known, steps),
         gains=gains,
         half_pixel=half_pixel,
         testimonies=[outside.testimonies(i) for i in image_idxs] if asked else [None] * len(images),
@@ -158,14 +160,10 @@ def _parts(consistency: ModelConsistency, image_idxs: range) -> MeasuredParts:
     )
 
 
-def _own(model: SparseModel, images: IntArray, known: BoolArray, steps: Sequence[CameraStep | None]) -> MeasuredOwn:
+def _own(facts: ModelFacts, images: IntArray, known: BoolArray, steps: Sequence[CameraStep | None]) -> MeasuredOwn:
     """The own parameters of each image's camera; images of one camera have one record."""
-    of_camera: dict[int, OwnDiagnostics] = {}
-    records: list[OwnDiagnostics | None] = []
-    for step in steps:
-        if step is not None and step.camera_idx not in of_camera:
-            of_camera[step.camera_idx] = own_diagnostics(step, step.sigma_px)
-        records.append(None if step is None else of_camera[step.camera_idx])
+    records = [None if step is None else facts.own[step.camera_idx] for step in steps]
+    model = facts.model
     cameras = model.images.camera_idx[images].tolist()
     has = {c: c >= 0 and bool(fitted_param_idxs(model.camera(c).model)) for c in set(cameras)}
     has_own = (asked and has[c] for asked, c in zip(known.tolist(), cameras, strict=True))

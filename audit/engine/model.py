@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
-from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, SharedMisfit
+from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, OwnDiagnostics, SharedMisfit
 from sfm_audit.audit.decision.triage import CAMERA_COLUMNS, triage
 from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
 from sfm_audit.audit.engine.findings import (
@@ -194,6 +194,11 @@ class ModelAuditor:
         return {} if self.joint is None else {step.camera_idx: step for step in self.joint.steps}
 
     @cached_property
+    def own(self) -> dict[int, OwnDiagnostics]:
+        """By row of the camera table: the same as what decides."""
+        return {camera_idx: own_diagnostics(step, step.sigma_px) for camera_idx, step in self.steps.items()}
+
+    @cached_property
     def implied(self) -> dict[int, dict[str, float]]:
         """By row of the camera table and column: changes that parameters which nobody freed would take."""
         return {} if self.joint is None else implied_by_camera(self.joint.implied)
@@ -286,7 +291,7 @@ class ModelAuditor:
         sigma_px = float(self.sigma_constant_px[image_idx])
         return {
             "has_own": has_own,
-            "own": own_diagnostics(step, step.sigma_px),
+            "own": self.own[step.camera_idx],
             "gains": gains_of(joint, image_idx),
             "camera": joint_camera(camera_diagnostics(quality), quality, step),
             "expected_error_px": expected_error_px(quality, joint.covariances[image_idx], sigma_px),
@@ -340,7 +345,7 @@ class ModelAuditor:
         own_findings += [*consistency_findings(self.consistency), *joint_findings(self.model, self.joint, self.tau_px)]
         findings = [*self.model.findings, *pose_findings(self.model), *own_findings, *self.outside.findings]
         audits = [settled(camera, said.camera_rejected) for camera in self.cameras]
-        cameras = camera_columns(self.model, audits, labels, self.joint, self.implied)
+        cameras = camera_columns(self, audits, labels)
         row = model_row(
             self.model, labels, self.tracks, self.stored_errors, findings, said.counts, self.outside.witnesses
         )

@@ -11,9 +11,9 @@ import numpy as np
 from sfm_audit.audit.decision.columns import cause_columns
 from sfm_audit.audit.engine.camera import CameraAudit
 from sfm_audit.audit.engine.image_table import OWN_COLUMNS, own_numbers
-from sfm_audit.audit.engine.jointly import below_diagonal, own_diagnostics
+from sfm_audit.audit.engine.jointly import below_diagonal
+from sfm_audit.audit.engine.known import ModelFacts
 from sfm_audit.audit.inliers.stored_errors import StoredErrors
-from sfm_audit.audit.joint import JointAudit
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
@@ -54,19 +54,13 @@ def misfit_columns(tests: MisfitTests | None) -> Row:
     return row
 
 
-def camera_columns(
-    model: SparseModel,
-    audits: Sequence[CameraAudit],
-    labels: ModelLabels,
-    joint: JointAudit | None,
-    implied: Mapping[int, Mapping[str, float]],
-) -> dict[str, Column]:
-    """Return the columns of cameras; ``implied`` by row of the camera table: changes of parameters nobody freed."""
-    rows = [int(model.images.camera_idx[audit.image_idxs[0]]) for audit in audits]
-    of_joint = {step.camera_idx: step for step in joint.steps} if joint else {}
-    steps = [of_joint.get(row) for row in rows]
-    own = [own_numbers(None if step is None else own_diagnostics(step, math.nan)) for step in steps]
-    freed = [implied.get(row, {}) if step else {} for row, step in zip(rows, steps, strict=True)]
+def camera_columns(facts: ModelFacts, audits: Sequence[CameraAudit], labels: ModelLabels) -> dict[str, Column]:
+    """Return the columns of cameras; facts: that their model's images share."""
+    joint = facts.joint
+    rows = [int(facts.model.images.camera_idx[audit.image_idxs[0]]) for audit in audits]
+    steps = [facts.steps.get(row) for row in rows]
+    own = [own_numbers(facts.own.get(row)) for row in rows]
+    freed = [facts.implied.get(row, {}) if step else {} for row, step in zip(rows, steps, strict=True)]
     cameras, same = [audit.camera for audit in audits], np.zeros(len(audits), dtype=np.int64)
     tested = [{**misfit_columns(audit.tests), **cause_columns(audit.misfit)} for audit in audits]
     names = {**misfit_columns(None), **cause_columns(None)}

@@ -75,8 +75,9 @@ def build_table(columns: Mapping[str, Column], wanted: pa.Schema) -> pa.Table:
     TypeError
         A column's values are of another kind than its type, such as floats for a count.
     """
-    missing = [name for name in wanted.names if name not in columns]
-    unknown = [name for name in columns if name not in wanted.names]
+    names = wanted.names  # a new list each time
+    missing = [name for name in names if name not in columns]
+    unknown = [name for name in columns if name not in set(names)] if len(columns) != len(names) or missing else []
     if missing or unknown:
         raise ValueError(f"columns do not match the schema: missing {missing}, unknown {unknown}")
     lengths = {name: len(values) for name, values in columns.items()}
@@ -107,6 +108,8 @@ def _build_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
 
 def _number_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
     dtype = np.dtype(str(kind))
+    if type(values) is np.ndarray and values.dtype == dtype == np.float64:  # no mask
+        return pa.Array.from_buffers(kind, len(values), [_validity(np.isfinite(values)), _buffer(values)])
     array, valid = _split_missing(values, dtype)
     if len(array) and array.dtype.kind not in {"f": "fiu", "b": "b"}.get(dtype.kind, "iu"):
         raise TypeError(f"expected {kind}, found {array.dtype}")
