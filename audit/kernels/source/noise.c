@@ -286,11 +286,94 @@ INLINE void estimating_equation(const Image *image, const double theta[2], doubl
     derivative[0] = -sum(d00), derivative[1] = -sum(d01), derivative[2] = -sum(d11);
 }
 
-/* fit_variance of audit/noise/fits.py; where a step would not be Newton's, numpy is to do it. */
+/* One step of Newton's that stays near theta > 0; 0 where there is none. */
+INLINE int newton_step(const Image *image, const double theta[2], double next[2])
+{
+    double e[2], d[3];
+    if (!(theta[0] > 0.0 && theta[1] > 0.0))
+        return 0;
+    estimating_equation(image, theta, e, d);
+    const double determinant = d[0] * d[2] - d[1] * d[1];
+    if (!(determinant > 0.0 && d[0] < 0.0))
+        return 0;
+    next[0] = theta[0] - (d[2] * e[0] - d[1] * e[1]) / determinant;
+    next[1] = theta[1] - (d[0] * e[1] - d[1] * e[0]) / determinant;
+    return next[0] > 0.1 * theta[0] && next[1] > 0.1 * theta[1] && next[0] < 10.0 * theta[0] && next[1] < 10.0 * theta[1];
+}
+
+/* One scoring step: a line through winsorised responses with weights 1 / s^2, theta >= 0; 0 where it is not determined. */
+INLINE int scoring_step(const Image *image, const double theta[2], double next[2])
+{
+    Lanes g00 = all(0.0), g01 = g00, g11 = g00, r0 = g00, r1 = g00;
+    for (int64_t k = 0; k < image->m; k += LANES) {
+        const Lanes a = load(image->a + k), s = theta[0] + theta[1] * a;
+        const LaneBits used = rows_below(k, image->m) & (s > 0.0);
+        const Lanes by_s = choose(used, 1.0 / s, all(0.0)), weight = 2.0 * by_s * by_s, most = all(CUTOFF_SQ);
+        const Lanes mass = lesser(load(image->y[0] + k) * by_s, most) + lesser(load(image->y[1] + k) * by_s, most);
+        const Lanes response = mass * by_s / image->kappa;
+        g00 += weight, g01 += weight * a, g11 += weight * a * a;
+        r0 += response, r1 += response * a;
+    }
+    const double g[3] = {sum(g00), sum(g01), sum(g11)}, r[2] = {sum(r0), sum(r1)}, det = g[0] * g[2] - g[1] * g[1];
+    if (!(det > 1e-9 * g[0] * g[2]))
+        return 0;
+    next[0] = (g[2] * r[0] - g[1] * r[1]) / det;
+    next[1] = (g[0] * r[1] - g[1] * r[0]) / det;
+    if (next[0] >= 0.0 && next[1] >= 0.0)
+        return 1;
+    const int constant = -r[0] * r[0] / g[0] <= -r[1] * r[1] / g[2]; /* the edge where the sum of squares is smaller */
+    next[0] = constant ? r[0] / g[0] : 0.0;
+    next[1] = constant ? 0.0 : r[1] / g[2];
+    return 1;
+}
+
+/* The fit where its two boundaries are not it, from the first scoring step on; least, most: of a. */
+INLINE int fit_both(const Image *image, double variance, double least, double most, double out[NOISE_COLUMNS])
+{
+    Lanes s = all(0.0), up = s, down = s, up_origin = s, down_origin = s;
+    for (int64_t k = 0; k < image->m; k += LANES)
+        s += load(image->a + k);
+    const double mean = sum(s) / (double)image->m;
+    for (int64_t k = 0; k < image->m; k += LANES) {
+        const Lanes a = load(image->a + k), centred = choose(rows_below(k, image->m), a - mean, all(0.0));
+        const Lanes excess = excess_of(image, k, all(1.0 / variance));
+        up += excess * centred;
+        down += centred * centred;
+        up_origin += variance * (1.0 + 0.5 * excess) * a;
+        down_origin += a * a;
+    }
+    double theta[2];
+    theta[1] = variance * sum(up) / sum(down) / 2.0;
+    theta[0] = variance - theta[1] * mean;
+    if (!(theta[1] * mean <= variance)) {
+        theta[0] = 0.0;
+        theta[1] = sum(up_origin) / sum(down_origin);
+    }
+    for (int i = 0; i < MAX_ITERATIONS; i++) {
+        double next[2];
+        const int newton = newton_step(image, theta, next);
+        if (!newton && !scoring_step(image, theta, next))
+            return FIT_NEEDS_NUMPY;
+        const double ends[2] = {least, most}, tolerance = newton ? 1e-4 : 1e-8;
+        int still = 1;
+        for (int j = 0; j < 2; j++) {
+            const double before = theta[0] + theta[1] * ends[j], after = next[0] + next[1] * ends[j];
+            still = still && fabs(after - before) <= tolerance * before;
+        }
+        theta[0] = next[0], theta[1] = next[1];
+        if (still) {
+            out[DETECTOR] = theta[0], out[STRUCTURE] = theta[1];
+            return DONE;
+        }
+    }
+    return FIT_NEEDS_NUMPY;
+}
+
+/* fit_variance of audit/noise/fits.py; numpy is to do it where no step is determined or the steps do not end. */
 INLINE int fit_variance(const Image *image, double out[NOISE_COLUMNS])
 {
     const int64_t m = image->m;
-    double least, most, of_a = 0.0, a_mean = 0.0, variance, theta[2], scale;
+    double least, most, variance, scale;
     memcpy(image->spare, image->y[0], (size_t)m * sizeof(double));
     memcpy(image->spare + m, image->y[1], (size_t)m * sizeof(double));
     memset(image->spare + 2 * m, 0, LANES * sizeof(double));
@@ -300,14 +383,12 @@ INLINE int fit_variance(const Image *image, double out[NOISE_COLUMNS])
     out[DETECTOR] = variance, out[STRUCTURE] = 0.0, out[CONVERGED] = 1.0;
     if (least == most)
         return DONE;
-    Lanes s = all(0.0), s2 = all(0.0);
-    for (int64_t k = 0; k < m; k += LANES) {
+    Lanes s = all(0.0);
+    for (int64_t k = 0; k < m; k += LANES)
         s += excess_of(image, k, all(1.0 / variance)) * load(image->a + k);
-        s2 += load(image->a + k);
-    }
-    of_a = sum(s), a_mean = sum(s2) / (double)m;
-    if (!(of_a > 0.0))
-        return of_a <= 0.0 ? DONE : FIT_NEEDS_NUMPY;
+    const double rise = sum(s);
+    if (!(rise > 0.0))
+        return rise <= 0.0 ? DONE : FIT_NEEDS_NUMPY;
     if (least > 0.0) {
         for (int64_t k = 0; k < m; k++) {
             image->spare[k] = image->y[0][k] / image->a[k];
@@ -325,40 +406,7 @@ INLINE int fit_variance(const Image *image, double out[NOISE_COLUMNS])
             }
         }
     }
-    Lanes up = all(0.0), down = all(0.0); /* the first scoring step: a line through equally weighted responses */
-    for (int64_t k = 0; k < m; k += LANES) {
-        const Lanes centred = choose(rows_below(k, m), load(image->a + k) - a_mean, all(0.0));
-        up += excess_of(image, k, all(1.0 / variance)) * centred;
-        down += centred * centred;
-    }
-    theta[1] = variance * sum(up) / sum(down) / 2.0;
-    theta[0] = variance - theta[1] * a_mean;
-    if (!(theta[0] > 0.0 && theta[1] > 0.0))
-        return FIT_NEEDS_NUMPY;
-    for (int i = 0; i < MAX_ITERATIONS; i++) {
-        double e[2], d[3];
-        estimating_equation(image, theta, e, d);
-        const double determinant = d[0] * d[2] - d[1] * d[1];
-        if (!(determinant > 0.0 && d[0] < 0.0))
-            return FIT_NEEDS_NUMPY;
-        const double next[2] = {theta[0] - (d[2] * e[0] - d[1] * e[1]) / determinant,
-                                theta[1] - (d[0] * e[1] - d[1] * e[0]) / determinant};
-        for (int j = 0; j < 2; j++)
-            if (!(next[j] > 0.1 * theta[j] && next[j] < 10.0 * theta[j]))
-                return FIT_NEEDS_NUMPY;
-        const double ends[2] = {least, most};
-        int still = 1;
-        for (int j = 0; j < 2; j++) {
-            const double before = theta[0] + theta[1] * ends[j], after = next[0] + next[1] * ends[j];
-            still = still && fabs(after - before) <= 1e-4 * before;
-        }
-        theta[0] = next[0], theta[1] = next[1];
-        if (still) {
-            out[DETECTOR] = theta[0], out[STRUCTURE] = theta[1];
-            return DONE;
-        }
-    }
-    return FIT_NEEDS_NUMPY;
+    return fit_both(image, variance, least, most, out);
 }
 
 /* Take the image's verified observations out of the model's columns; 0 where a number cannot be used. */
