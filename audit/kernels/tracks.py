@@ -118,18 +118,31 @@ class PriorGroups:
     other_sq_px2: FloatArray
 
     @classmethod
-    def of(cls, sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: Int32Array | IntArray) -> PriorGroups | None:
-        """Group (m,) observations; None where the kernels are not to be used."""
-        run = kernel("prior_groups", Size, Doubles, Doubles, SmallInts, Ints, Doubles, Doubles)
-        if run is None:
+    def of(
+        cls, e: FloatArray, other_sq_px2: FloatArray, other_dof: Int32Array | IntArray, used: BoolArray | None = None
+    ) -> PriorGroups | None:
+        """Group observations by their degrees of freedom; None where the kernels are not to be used.
+
+        Parameters
+        ----------
+        e : (2, n) whitened residuals, px, or (n,) squares of their lengths
+        used : (n,) which of them; all when None
+        """
+        count = kernel("prior_counts", Size, Bytes, SmallInts, Size, Ints)
+        run = kernel("prior_groups", Size, Bytes, Doubles, Size, Doubles, SmallInts, Ints, Doubles, Doubles)
+        if count is None or run is None:
             return None
-        of_dof = np.bincount(other_dof)  # not negative, or this raises
+        n, mask = other_dof.size, np.ones(other_dof.size, dtype=np.bool_) if used is None else used
+        if e.shape not in {(n,), (2, n)} or other_sq_px2.shape != (n,) or mask.shape != (n,):
+            raise ValueError("residuals, sums of squares, degrees of freedom and mask are not of one size")
+        dof = np.ascontiguousarray(other_dof, dtype=np.int32)
+        of_dof = np.zeros(max(int(dof.max(initial=0)), 0) + 1, dtype=np.int64)
+        if count(n, mask.view(np.uint8), dof, of_dof.size, of_dof):
+            raise ValueError("degrees of freedom are negative")
         rows = np.concatenate([[0], np.cumsum(-(-of_dof // _LANES) * _LANES)])
         sq, other = np.zeros(rows[-1]), np.full(rows[-1], 2.0**1000)
-        dof = np.ascontiguousarray(other_dof, dtype=np.int32)
-        run(
-            dof.size, np.ascontiguousarray(sq_px2), np.ascontiguousarray(other_sq_px2), dof, rows[:-1].copy(), sq, other
-        )
+        given = np.ascontiguousarray(e), int(e.ndim == 1), np.ascontiguousarray(other_sq_px2), dof
+        run(n, mask.view(np.uint8), *given, rows[:-1].copy(), sq, other)
         there = np.flatnonzero(of_dof)
         return cls(there.astype(np.float64), of_dof[there], np.append(rows[there], rows[-1]), sq, other)
 

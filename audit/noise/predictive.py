@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import special
@@ -25,29 +26,50 @@ MIN_SLOPE = 1e-3  # of the robust variance in ln f, at which a step of Newton's 
 _MANY, _EVERY = 256, 8  # observations, from which on every 8th says where to begin
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the tracks predict for n observations: scale (n,) px of (4), degrees of freedom by table row.
+    """What the tracks predict for observations: scale (n,) px of (4), degrees of freedom by table row.
 
-    nu_values: (v,) the distinct nu = nu0 + nu_k.        nu_row: (n,) row of nu_values for each observation.
-    dof_values: (v,) the distinct nu_k.
+    prior: of the tracks.    dof_values: (v,) the distinct nu_k, ascending.
+    all_other_sq_px2, all_other_dof: (m,) c and nu_k.    used: (m,) of which observations; all when None.
     """
 
-    scale_px: FloatArray
-    nu_values: FloatArray
-    nu_row: Int32Array
+    prior: TrackPrior
     dof_values: IntArray
+    all_other_sq_px2: FloatArray
+    all_other_dof: Int32Array | IntArray
+    used: BoolArray | None = None
+
+    @property
+    def nu_values(self) -> FloatArray:
+        """(v,) the distinct nu = nu0 + nu_k."""
+        return self.prior.nu0 + self.dof_values.astype(np.float64)
+
+    @cached_property
+    def nu_row(self) -> Int32Array:
+        """(n,) row of nu_values for each observation."""
+        row_of = np.zeros(int(self.dof_values[-1]) + 1 if self.dof_values.size else 1, dtype=np.int32)
+        row_of[self.dof_values] = np.arange(self.dof_values.size)
+        return row_of[self.all_other_dof if self.used is None else self.all_other_dof[self.used]]
+
+    @cached_property
+    def scale_px(self) -> FloatArray:
+        """(n,) scale of (4), px."""
+        other_sq_px2 = self.all_other_sq_px2 if self.used is None else self.all_other_sq_px2[self.used]
+        scale_sq = (self.prior.nu0 * self.prior.s0_px**2 + other_sq_px2) / self.nu_values[self.nu_row]
+        return np.asarray(np.sqrt(scale_sq), dtype=np.float64)
 
 
-def predict(prior: TrackPrior, other_sq_px2: FloatArray, other_dof: Int32Array | IntArray) -> Prediction:
-    """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4)."""
-    distinct = np.flatnonzero(np.bincount(other_dof))  # small positive integers: no need to sort two million of them
-    row_of = np.zeros(int(distinct[-1]) + 1 if distinct.size else 1, dtype=np.int32)
-    row_of[distinct] = np.arange(distinct.size)
-    row = row_of[other_dof]
-    nu = prior.nu0 + distinct.astype(np.float64)
-    scale_sq = (prior.nu0 * prior.s0_px**2 + other_sq_px2) / nu[row]
-    return Prediction(np.sqrt(scale_sq), nu, row, distinct)
+def predict(
+    prior: TrackPrior,
+    other_sq_px2: FloatArray,
+    other_dof: Int32Array | IntArray,
+    used: BoolArray | None = None,
+) -> Prediction:
+    """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4); used: (n,) of which, all when None."""
+    own = other_dof if used is None else other_dof[used]
+    distinct = np.flatnonzero(np.bincount(own))  # small positive integers: no need to sort two million of them
+    return Prediction(prior, distinct, other_sq_px2, other_dof, used)
 
 
 class StudentToNormal:

@@ -5,18 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sfm_audit.audit.kernels.tracks import PriorGroups
-from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
+from sfm_audit.audit.noise.tracks import TrackStatistics
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 MIN_OBSERVATIONS = 20
 NU0_RANGE = (0.1, 1e4)
 _CHUNK = 1 << 15
+_MANY = 20_000  # observations, of which some say where to begin
 _MAX_ITERATIONS = 60
 _MAX_RADIUS = 2.0  # of a step in (ln nu0, ln s0^2)
 _CONVERGED_NATS = 1e-8  # predicted gain of the last step, which is still taken
+
+
+_Sums = Callable[[float, float], FloatArray]
+"""From nu0 and P to the log likelihood and its derivatives by nu0, P, nu0 nu0, nu0 P, P P: (6,)."""
+_IN_RANGE = (1e-140, 1e140)  # of P and of sums of squares for the compiled sums
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +62,33 @@ def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: Int
         total_sq_px2 = float(sq_px2.sum() + other_sq_px2.sum())
     if sq_px2.size < MIN_OBSERVATIONS or not sq_px2.any() or not math.isfinite(total_sq_px2):
         return TrackPrior(math.nan, math.nan, converged=False)
-    stride = max(1, sq_px2.size // 20_000)
+    stride = max(1, sq_px2.size // _MANY)
     sample = sq_px2[::stride], other_sq_px2[::stride], other_dof[::stride]
+    return _fit(sample, sq_px2.size, lambda: _sums_of(sq_px2, other_sq_px2, other_dof))
+
+
+def fit_prior_of_tracks(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
+    """`fit_track_prior` of the observations that are used (n,), all verified, with few arrays of their size."""
+    num_used = int(np.count_nonzero(used))
+    total_sq_px2 = float(np.add.reduce(tracks.other_sq_px2, where=used))
+    groups = None
+    if num_used >= MIN_OBSERVATIONS and total_sq_px2 < _IN_RANGE[1]:
+        groups = PriorGroups.of(tracks.whitened_px, tracks.other_sq_px2, tracks.other_dof, used)
+    if groups is None or not 0.0 < float(groups.sq_px2.sum()) < _IN_RANGE[1]:
+        sq_px2 = (tracks.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
+        return fit_track_prior(sq_px2, tracks.other_sq_px2[used], tracks.other_dof[used])
+    rows = np.flatnonzero(used)[:: max(1, num_used // _MANY)]
+    sq_px2 = (tracks.whitened_px[:, rows] ** 2).sum(axis=0)
+    dof, other_sq_px2 = tracks.other_dof[rows], tracks.other_sq_px2[rows]
+    return _fit((sq_px2, other_sq_px2, dof), num_used, lambda: partial(_sums_by_group, groups))
+
+
+_Sample = tuple[FloatArray, FloatArray, Int32Array | IntArray]
+"""q, c and degrees of freedom of some observations."""
+
+
+def _fit(sample: _Sample, num_observations: int, sums_of_all: Callable[[], _Sums]) -> TrackPrior:
+    """Climb on the sample, and then on all where the sample is not all."""
     grid = [
         np.array([math.log(nu0), math.log(s0_sq)])
         for s0_sq in _scale_grid(*sample)
@@ -64,8 +97,8 @@ def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: Int
     sums = _sums_of(*sample)
     best = max(grid, key=lambda x: _log_likelihood(x, sums).value)
     found = _maximise(best, sums, sample[0].size)
-    if stride > 1:
-        found = _maximise(found.x, _sums_of(sq_px2, other_sq_px2, other_dof), sq_px2.size)
+    if sample[0].size < num_observations:
+        found = _maximise(found.x, sums_of_all(), num_observations)
     if not math.isfinite(found.value):
         return TrackPrior(math.nan, math.nan, converged=False)
     return TrackPrior(math.exp(found.x[0]), math.exp(0.5 * found.x[1]), found.converged)
@@ -76,11 +109,6 @@ def _scale_grid(sq: FloatArray, other_sq: FloatArray, dof: Int32Array | IntArray
     centre = max(float(np.median(sq)) / (2.0 * math.log(2.0)), np.finfo(np.float64).tiny)
     pooled = max(float((sq + other_sq).sum() / (dof + 2.0).sum()), centre)
     return [centre * 0.3, centre, pooled]
-
-
-_Sums = Callable[[float, float], FloatArray]
-"""From nu0 and P to the log likelihood and its derivatives by nu0, P, nu0 nu0, nu0 P, P P: (6,)."""
-_IN_RANGE = (1e-140, 1e140)  # of P and of sums of squares for the compiled sums
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,16 +201,18 @@ def _sums_of(sq: FloatArray, other_sq: FloatArray, other_dof: Int32Array | IntAr
 
     def sums(nu0: float, prior_sq: float) -> FloatArray:
         if groups is not None and _IN_RANGE[0] < prior_sq < _IN_RANGE[1]:
-            return _sums_by_group(nu0, groups.dof, groups.counts, groups.sums(prior_sq).T)
+            return _sums_by_group(groups, nu0, prior_sq)
         return _sums(nu0, prior_sq, sq, other_sq, dof)
 
     return sums
 
 
-def _sums_by_group(nu0: float, dof: FloatArray, counts: IntArray, of_group: FloatArray) -> FloatArray:
-    """`_sums` of groups of equal degrees of freedom (g,), of_group (6, g) of `PriorGroups.sums`."""
-    log_ratio, log_bq, inv_b, inv_bq, inv_b_sq, inv_bq_sq = of_group
-    nu = dof + nu0
+def _sums_by_group(groups: PriorGroups, nu0: float, prior_sq: float) -> FloatArray:
+    """`_sums` of groups of equal degrees of freedom; NaN, to which no step goes, where P is out of their range."""
+    if not _IN_RANGE[0] < prior_sq < _IN_RANGE[1]:
+        return np.full(6, math.nan)
+    log_ratio, log_bq, inv_b, inv_bq, inv_b_sq, inv_bq_sq = groups.sums(prior_sq).T
+    counts, nu = groups.counts, groups.dof + nu0
     half = 0.5 * nu
     return np.array(
         [

@@ -21,7 +21,7 @@ from sfm_audit.audit.noise.fits import (
 )
 from sfm_audit.audit.noise.predictive import LAST_STEP, MIN_SLOPE, TrackStandardiser, robust_excess, student_to_normal
 from sfm_audit.audit.noise.standardise import PREDICTOR_QUANTILE, ImageNoise, ModelTracks, paper_fit, track_noise
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 MAX_OBSERVATIONS: Final = 64
 """Images with more are looked at one by one: there the values cost more than the calls, and few have as many."""
@@ -123,7 +123,8 @@ def _compiled_track_noises(
         *(prior.nu0, prior.s0_px, standardiser.prediction.dof_values, standardiser.tables),
     ).noises(tracks.offsets[part], verified_offsets, CONSISTENCY)
     starts = (verified_offsets - verified_offsets[0]).tolist()
-    _transform_outside(found, standardiser, slice(int(verified_offsets[0]), int(verified_offsets[-1])))
+    columns = slice(int(tracks.offsets[part][0]), int(tracks.offsets[part][-1]))
+    _transform_outside(found, standardiser, statistics.other_dof[columns][statistics.verified[columns]])
     out: dict[int, ImageNoise] = {}
     with np.errstate(invalid="ignore"):
         detector, structure = np.sqrt(found.detector_px2).tolist(), np.sqrt(found.structure).tolist()
@@ -144,11 +145,11 @@ def _compiled_track_noises(
     return out
 
 
-def _transform_outside(found: kernel.TrackNoises, standardiser: TrackStandardiser, rows: slice) -> None:
-    """Transform the t that are beyond the tables, where z holds them."""
+def _transform_outside(found: kernel.TrackNoises, standardiser: TrackStandardiser, other_dof: Int32Array) -> None:
+    """Transform the t that are beyond the tables, where z holds them; other_dof: (V,) of the rows of z."""
     row, axis = np.nonzero(found.outside)
     if row.size:
-        nu = standardiser.prediction.nu_values[standardiser.prediction.nu_row[rows][row]] + axis
+        nu = standardiser.prediction.prior.nu0 + (other_dof[row] + axis).astype(np.float64)
         found.z[row, axis] = student_to_normal(found.z[row, axis], nu)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.fits import VarianceFit, fit_constant_variance, fit_variance
 from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
-from sfm_audit.audit.noise.prior import TrackPrior, fit_track_prior
+from sfm_audit.audit.noise.prior import TrackPrior, fit_prior_of_tracks
 from sfm_audit.audit.noise.tracks import TrackStatistics, track_statistics
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
@@ -91,14 +91,11 @@ def model_tracks(
         left_out=own_left_out,
     )
     used = statistics.verified & ~own_left_out
-    sq = (statistics.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
-    prior = fit_track_prior(sq, statistics.other_sq_px2[used], statistics.other_dof[used])
+    prior = fit_prior_of_tracks(statistics, used)
     standardiser = None
     if math.isfinite(prior.nu0):
-        verified = statistics.verified
-        standardiser = TrackStandardiser.build(
-            predict(prior, statistics.other_sq_px2[verified], statistics.other_dof[verified])
-        )
+        prediction = predict(prior, statistics.other_sq_px2, statistics.other_dof, statistics.verified)
+        standardiser = TrackStandardiser.build(prediction)
     verified_before = np.concatenate([[0], np.cumsum(statistics.verified)])
     return ModelTracks(
         statistics, moved, too_many, residuals.offsets, verified_before[residuals.offsets], prior, standardiser

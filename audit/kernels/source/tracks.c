@@ -124,14 +124,29 @@ KERNEL int64_t track_others(int64_t n, const int64_t *point_idx, const uint8_t *
     return DONE;
 }
 
-/* Put |e|^2 and the others' sum of squares of m observations where those of equal degrees of freedom stand together;
- * next: where the next of each goes. */
-KERNEL int64_t prior_groups(int64_t m, const double *sq, const double *other_sq, const int32_t *dof, int64_t *next,
-                            double *sq_out, double *other_out)
+/* How many of the used observations have each number of degrees of freedom; or that one has another. */
+KERNEL int64_t prior_counts(int64_t n, const uint8_t *used, const int32_t *dof, int64_t num_groups, int64_t *counts)
 {
-    for (int64_t k = 0; k < m; k++) {
+    for (int64_t k = 0; k < n; k++) {
+        if (!used[k])
+            continue;
+        if (dof[k] < 0 || dof[k] >= num_groups)
+            return NEEDS_NUMPY;
+        counts[dof[k]]++;
+    }
+    return DONE;
+}
+
+/* Put |e|^2 and the others' sum of squares of the used observations where those of equal degrees of freedom stand
+ * together; next: where the next of each goes. e (2, n), or |e|^2 (n,). */
+KERNEL int64_t prior_groups(int64_t n, const uint8_t *used, const double *e, int64_t is_squared, const double *other_sq,
+                            const int32_t *dof, int64_t *next, double *sq_out, double *other_out)
+{
+    for (int64_t k = 0; k < n; k++) {
+        if (!used[k])
+            continue;
         const int64_t at = next[dof[k]]++;
-        sq_out[at] = sq[k];
+        sq_out[at] = is_squared ? e[k] : e[k] * e[k] + e[n + k] * e[n + k];
         other_out[at] = other_sq[k];
     }
     return DONE;
