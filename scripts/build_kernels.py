@@ -19,6 +19,8 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,7 +33,6 @@ FLAGS = [
     "-std=gnu99",
     "-O3",
     "-fno-trapping-math",
-    "-shared",
     "-ffp-contract=off",
     "-fno-math-errno",
     "-fvisibility=hidden",
@@ -74,34 +75,48 @@ def platform_flags() -> list[str]:
 
 
 def build(library: Path = LIBRARY, extra: list[str] | None = None) -> str | None:
-    """Compile; None when it worked, else why there is no library."""
+    """Compile the sources beside each other and link them; None when it worked, else why there is no library."""
     command = compiler()
     if command is None:
         return NO_COMPILER
     partial = library.with_suffix(f".{os.getpid()}.partial")
-    sources = [str(path) for path in sorted(SOURCES.glob("*.c"))]
     extra = ["-s"] if extra is None and sys.platform != "darwin" else extra or []  # -s: no names of static functions
-    flags = [*FLAGS, *platform_flags(), *WARNINGS, *extra, f'-DSFM_SOURCES="{sources_hash()}"']
+    common = [*command, *FLAGS, *platform_flags(), *WARNINGS, *extra]
+    compiled = [*common, f'-DSFM_SOURCES="{sources_hash()}"', "-c"]
     try:
-        done = subprocess.run(
-            [*command, *flags, "-o", str(partial), *sources, "-lm"],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-            stdin=subprocess.DEVNULL,
-            timeout=LIMIT_SECONDS,
-        )
-        if done.returncode:
-            return f"{shlex.join(command)} failed: {done.stderr.strip() or f'exit code {done.returncode}'}"
-        if done.stderr:
-            print(done.stderr, file=sys.stderr)
+        with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            objects = {str(Path(folder) / f"{source.stem}.o"): str(source) for source in sorted(SOURCES.glob("*.c"))}
+            problems = list(pool.map(lambda item: _run([*compiled, "-o", *item]), objects.items()))
+            problems.append(
+                _run([*common, "-shared", "-o", str(partial), *objects, "-lm"]) if not any(problems) else ""
+            )
+        wrong = next(filter(None, problems), None)
+        if wrong is not None:
+            return f"{shlex.join(command)} failed: {wrong}"
         partial.replace(library)
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{shlex.join(command)} cannot be used: {error}"
     finally:
         partial.unlink(missing_ok=True)
     return None
+
+
+def _run(command: list[str]) -> str:
+    """Run the compiler; return what is wrong, nothing where it worked. Warnings are printed."""
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+        stdin=subprocess.DEVNULL,
+        timeout=LIMIT_SECONDS,
+    )
+    if done.returncode:
+        return done.stderr.strip() or f"exit code {done.returncode}"
+    if done.stderr:
+        print(done.stderr, file=sys.stderr)
+    return ""
 
 
 def is_stale(library: Path = LIBRARY) -> bool:

@@ -1,5 +1,6 @@
 """Fixtures that several folders of tests share."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,18 @@ from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 # The same examples every time, so that red means the change; --hypothesis-profile=default looks for new ones.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def quick_compiler(tmp_path_factory) -> str:
+    """CC for tests that build all kernels: without optimisation, which is what takes the time."""
+    found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if found is None:
+        pytest.skip("no C compiler")
+    path = tmp_path_factory.mktemp("compiler") / "cc"
+    path.write_text(f'#!/bin/sh\nexec "{found}" "$@" -O0 -DSFM_ONE_CLONE\n')
+    path.chmod(0o755)
+    return str(path)
 
 
 BOTH_PATHS = "both_paths: runs with compiled kernels, and again with numpy alone (docs/kernels.md)"

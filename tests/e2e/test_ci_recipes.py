@@ -43,7 +43,8 @@ def pip_env():
     # Python finds the dependencies of this environment from any other one
     folders = {str(Path(importlib.util.find_spec(name).origin).parents[1]) for name in ("numpy", "hatchling")}
     pip = {"PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_NO_INDEX": "1"}
-    return {**os.environ, **pip, "PYTHONPATH": os.pathsep.join(folders), "PYTHONWARNINGS": ""}
+    own = {"PYTHONPATH": os.pathsep.join(folders), "PYTHONWARNINGS": "", "SFM_AUDIT_KERNELS": "0"}  # nothing to compile
+    return {**os.environ, **pip, **own}
 
 
 def origin(python, env, cwd):

@@ -44,9 +44,10 @@ def built(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
+def compiled(tmp_path_factory, quick_compiler):
     """A wheel with compiled kernels."""
-    (wheel,), _ = build(ROOT, tmp_path_factory.mktemp("compiled"), ("--target", "wheel"), SFM_AUDIT_KERNELS="1")
+    out = tmp_path_factory.mktemp("compiled")
+    (wheel,), _ = build(ROOT, out, ("--target", "wheel"), SFM_AUDIT_KERNELS="1", CC=quick_compiler)
     return wheel
 
 

@@ -1,5 +1,6 @@
 """scripts/build_kernels.py: which compiler, for which systems a library is, and of which sources."""
 
+import ctypes
 import importlib.util
 import platform
 import shutil
@@ -54,23 +55,43 @@ def test_without_glibc_or_linux_the_tag_promises_no_manylinux(tmp_path, monkeypa
     assert build_kernels.platform_tag(path) == "macosx_11_0_arm64"
 
 
+@pytest.fixture
+def sources(tmp_path, monkeypatch):
+    """Two small sources: all kernels take ten seconds to compile."""
+    folder = tmp_path / "source"
+    folder.mkdir()
+    for name in ("kernel.h", "version.c"):
+        shutil.copy(build_kernels.SOURCES / name, folder)
+    (folder / "one.c").write_text(
+        '#include "kernel.h"\nKERNEL WIDE int64_t one(double *x) { x[0] = 1.0; return DONE; }\n'
+    )
+    monkeypatch.setattr(build_kernels, "SOURCES", folder)
+    return folder
+
+
 @needs_compiler
-def test_a_library_carries_the_hash_of_its_sources(tmp_path, monkeypatch):
+def test_a_library_carries_the_hash_of_its_sources(tmp_path, monkeypatch, sources):
     monkeypatch.delenv("CC", raising=False)
-    path = tmp_path / "compiled.so"
+    path = tmp_path / "built" / "compiled.so"
+    path.parent.mkdir()
     assert build_kernels.is_stale(path)
     assert build_kernels.build(path) is None
     assert not build_kernels.is_stale(path)
-    assert build_kernels.sources_hash() == sources_hash()
-    assert [each.name for each in tmp_path.iterdir()] == ["compiled.so"]
+    assert build_kernels.sources_hash() == sources_hash(sources) != sources_hash()
+    assert [each.name for each in path.parent.iterdir()] == ["compiled.so"]
+    assert ctypes.CDLL(str(path)).one((ctypes.c_double * 1)()) == 0
     first = path.read_bytes()
     assert build_kernels.build(path) is None
     assert path.read_bytes() == first
-    path.write_bytes(first.replace(sources_hash().encode(), b"0" * 64))
+    (sources / "one.c").write_text('#include "kernel.h"\n')
     assert build_kernels.is_stale(path)
+    (sources / "one.c").write_text("no C\n")
+    assert "error" in build_kernels.build(path)
+    assert path.read_bytes() == first
 
 
 @needs_compiler
+@pytest.mark.usefixtures("sources")
 def test_cc_is_the_compiler_with_its_arguments(tmp_path, monkeypatch):
     (name,) = [name for name in build_kernels.COMPILERS if shutil.which(name)][:1]
     monkeypatch.setenv("CC", f"{name} -DSFM_ONE_CLONE '-DWORDS=1 + 1'")
