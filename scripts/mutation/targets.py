@@ -106,7 +106,12 @@ TARGETS: Final = (
     Target("audit/engine/model.py", NUMBERS, ("ModelAuditor.shared_misfit",)),
     Target("audit/engine/camera.py", NUMBERS, ("is_advisable", "images_advice")),
     Target(
-        "audit/consistency/image.py", LIMITS, ("ConsistencyLimits", "_judged", "_exceeds", "_is_tail", "_half_pixel")
+        "audit/consistency/image.py", LIMITS, ("ConsistencyLimits", "_judged", "_exceeds", "_is_tail", "half_pixel")
+    ),
+    Target(
+        "audit/consistency/together.py",
+        ("unit/test_kernel_consistency.py",),
+        ("clear_images", "_cameras", "_is_clear", "_CLEAR"),
     ),
     Target(
         "audit/consistency/model.py",

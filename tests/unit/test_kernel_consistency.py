@@ -10,13 +10,16 @@ import pytest
 from joint_reference import SPEC, model_of
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sfm_audit.audit.consistency import consistency_of, fit_affine
+from sfm_audit.audit.consistency import consistency_of, fit_affine, model_consistency
 from sfm_audit.audit.consistency.affine import KNEE, MEDIAN_LENGTH, median_of, root_mean_square
 from sfm_audit.audit.consistency.affine import _median_near as median_near
+from sfm_audit.audit.consistency.image import DEFAULT_LIMITS, LinkedPoints, consistency_of_linked
+from sfm_audit.audit.consistency.together import _is_clear as is_clear
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.consistency import AFFINE, NOTHING, RMS, fit_images
+from sfm_audit.audit.kernels.consistency import AFFINE, NOTHING, RMS, Fitted, fit_images
 from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraTable
 
 compiled = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here")
 
@@ -131,44 +134,116 @@ def assert_same(found, wanted):
                 assert type(value) is type(expected)
 
 
-def changed(model, kind):
-    """A model with one fault."""
-    observations, images, cameras = model.observations, model.images, model.cameras
-    xy, params = observations.xy_px.copy(), cameras.params.copy()
-    if kind == "half a pixel":
-        xy += 0.5
-    if kind == "an image of another resolution":
-        xy[: observations.offsets[1]] *= 0.5
-    if kind == "a camera without focal length":
-        params[0] = 0.0
-    if kind == "no camera":
-        images = dataclasses.replace(images, camera_idx=np.where(images.camera_idx == 1, -1, images.camera_idx))
-    if kind == "no width":
-        cameras = dataclasses.replace(cameras, width=np.where(np.arange(len(cameras)) == 2, 0, cameras.width))
-    point_idx = observations.point_idx.copy()
-    if kind == "few":
-        point_idx[observations.offsets[3] + 19 : observations.offsets[4]] = -1
-    if kind == "many behind":
-        translation = images.translation_cam_from_world.copy()
-        translation[2, 2] -= np.median(model.points.xyz_world[:, 2])
-        images = dataclasses.replace(images, translation_cam_from_world=translation)
-    return dataclasses.replace(
-        model,
-        cameras=dataclasses.replace(cameras, params=params),
-        images=images,
-        observations=dataclasses.replace(observations, xy_px=xy, point_idx=point_idx),
+def one_by_one(model):
+    """What is said where each image is asked by itself, in numpy."""
+    with numpy_only():
+        residuals = model_residuals(model)
+        images = []
+        for image_idx in range(len(model.images)):
+            linked = slice(*model.observations.offsets[image_idx : image_idx + 2])
+            rows = residuals.rows(image_idx)
+            points = LinkedPoints(
+                model.image(image_idx),
+                model.observations.xy_px[linked],
+                model.points.xyz_world,
+                model.observations.point_idx[linked],
+                residuals.observation_row[rows] - linked.start,
+                residuals.residuals_px[:, rows],
+                int(residuals.num_behind[image_idx]),
+                int(residuals.num_unprojected[image_idx]),
+            )
+            images.append(consistency_of_linked(points))
+    return model_consistency(images)
+
+
+def _behind(model, image_idx):
+    """A point behind the camera of an image."""
+    image = model.image(image_idx)
+    return image.rotation_cam_from_world.T @ (np.array([0.0, 0.0, -1.0]) - image.translation_cam_from_world)
+
+
+def but(model, table, **changed):
+    """A model with other columns in one of its tables."""
+    return dataclasses.replace(model, **{table: dataclasses.replace(getattr(model, table), **changed)})
+
+
+def half_a_pixel(model):
+    return but(model, "observations", xy_px=model.observations.xy_px + 0.5)
+
+
+def another_resolution(model):
+    xy = model.observations.xy_px.copy()
+    xy[: model.observations.offsets[1]] *= 0.5
+    return but(model, "observations", xy_px=xy)
+
+
+def no_focal_length(model):
+    params = model.cameras.params.copy()
+    params[0] = 0.0
+    return but(model, "cameras", params=params)
+
+
+def no_camera(model):
+    return but(model, "images", camera_idx=np.where(model.images.camera_idx == 1, -1, model.images.camera_idx))
+
+
+def no_size(model, side):
+    return but(
+        model, "cameras", **{side: np.where(np.arange(len(model.cameras)) == 2, 0, getattr(model.cameras, side))}
     )
 
 
-KINDS = ("nothing", "half a pixel", "an image of another resolution", "a camera without focal length", "no camera")
+def linked(model, num):
+    """One image with so many links, another with none."""
+    offsets, point_idx = model.observations.offsets, model.observations.point_idx.copy()
+    point_idx[offsets[3] + num : offsets[4]] = -1
+    point_idx[: offsets[1]] = -1
+    return but(model, "observations", point_idx=point_idx)
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "no width", "few", "many behind"])
-def test_a_model_is_judged_alike_on_both_paths(kind):
-    model = changed(model_of(dataclasses.replace(SPEC, num_images=5)), kind)
-    found = consistency_of(model, model_residuals(model))
+def behind(model, image_idx, share):
+    """This share of the observations of an image that have a point lie behind it."""
+    xyz, point_idx = model.points.xyz_world.copy(), model.observations.point_idx
+    own = point_idx[slice(*model.observations.offsets[image_idx : image_idx + 2])]
+    own = own[own >= 0]
+    xyz[own[: int(share * len(own))]] = _behind(model, image_idx)
+    return but(model, "points", xyz_world=xyz)
+
+
+FAULTS = {
+    "nothing": lambda model: model,
+    "half a pixel": half_a_pixel,
+    "an image of another resolution": another_resolution,
+    "a camera without focal length": no_focal_length,
+    "no camera": no_camera,
+    "no width": lambda model: no_size(model, "width"),
+    "no height": lambda model: no_size(model, "height"),
+    "19 linked": lambda model: linked(model, 19),
+    "20 linked": lambda model: linked(model, 20),
+    "20 linked, one behind": lambda model: behind(linked(model, 20), 3, 0.05),
+    "a tenth behind": lambda model: behind(model, 2, 0.1),
+    "a fifth behind": lambda model: behind(model, 2, 0.25),
+    "most behind": lambda model: behind(model, 1, 0.9),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_model_is_judged_as_its_images_are_one_by_one(fault):
+    model = FAULTS[fault](model_of(dataclasses.replace(SPEC, num_images=6)))
+    wanted = one_by_one(model)
+    assert_same(consistency_of(model, model_residuals(model)), wanted)
     with numpy_only():
-        assert_same(found, consistency_of(model, model_residuals(model)))
+        assert_same(consistency_of(model, model_residuals(model)), wanted)
+
+
+def test_a_model_without_cameras_is_unknown():
+    model = model_of(dataclasses.replace(SPEC, num_images=3))
+    none = np.empty(0, dtype=np.int64)
+    cameras = CameraTable(none.astype(np.uint32), none, none, none, np.empty(0), np.zeros(1, dtype=np.int64))
+    images = dataclasses.replace(model.images, camera_idx=np.full(3, -1))
+    model = dataclasses.replace(model, cameras=cameras, images=images)
+    assert_same(consistency_of(model), one_by_one(model))
+    assert [image.num_linked for image in consistency_of(model).images] == [0, 0, 0]
 
 
 def test_panoramas_are_judged_alike_on_both_paths():
@@ -181,10 +256,34 @@ def test_panoramas_are_judged_alike_on_both_paths():
         param_offsets=2 * np.arange(len(model.cameras) + 1),
     )
     model = dataclasses.replace(model, cameras=cameras)
+    xy = model.observations.xy_px - model_residuals(model).residuals_px.T  # where the panorama sees them
+    model = dataclasses.replace(model, observations=dataclasses.replace(model.observations, xy_px=xy + 0.3))
     found = consistency_of(model)
-    assert all(image.affine is None for image in found.images)
-    with numpy_only():
-        assert_same(found, consistency_of(model))
+    assert [(image.affine, image.inconsistent) for image in found.images] == [(None, False)] * 3
+    assert_same(found, one_by_one(model))
+
+
+def fitted_rms(stored, rest):
+    """Fits of which only lengths are known."""
+    n, pairs = len(stored), np.zeros((len(stored), 2))
+    maps = np.zeros((n, 2, 2))
+    lengths = (np.zeros(n), np.asarray(rest), np.asarray(stored))
+    return Fitted(np.ones(n, dtype=np.bool_), maps, pairs, pairs, pairs, *lengths)
+
+
+def test_an_image_is_clear_below_each_limit_by_more_than_rounding():
+    """1 % of 1600 px, and 20 px together with 20 times what the map leaves; of panoramas the first alone."""
+    stored = np.array([15.99, 16.01, 16.0 - 1e-6, 15.99, 15.99])
+    wide = np.full(5, 1600)
+    flat = np.ones(5, dtype=np.bool_)
+    assert is_clear(fitted_rms(stored, np.full(5, 9.0)), flat, wide, DEFAULT_LIMITS).tolist() == [
+        *(True, False, False),
+        *(True, True),
+    ]
+    rest = [1.0, 1.5, 1.24, 1.26, 0.1]
+    found = is_clear(fitted_rms([19.99, 20.01, 25.0, 25.0, 20.0 - 1e-6], rest), flat, 10 * wide, DEFAULT_LIMITS)
+    assert found.tolist() == [True, True, False, True, False]
+    assert is_clear(fitted_rms([25.0] * 5, rest), ~flat, 10 * wide, DEFAULT_LIMITS).all()
 
 
 @pytest.mark.parametrize("expected", [1e-9, 0.3, 0.48, 0.6, 5.0])
