@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_audit.audit.inliers.stationarity import offset_px, pose_columns
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.inliers.stationarity import offset_px, offsets_of_sums, pose_columns
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 _NUM_POSE = 6
@@ -52,7 +52,13 @@ def cross_matrix(vector: FloatArray) -> FloatArray:
 
 
 def frame_offsets_px(
-    model: SparseModel, frames: Frames, offsets: IntArray, point_idx: IntArray, on_points: tuple[FloatArray, FloatArray]
+    model: SparseModel,
+    frames: Frames,
+    offsets: IntArray,
+    point_idx: IntArray,
+    on_points: tuple[FloatArray, FloatArray],
+    *,
+    sums: tuple[FloatArray, FloatArray] | None = None,
 ) -> FloatArray:
     """Return (I,) pose_offset_px of the frame that each image belongs to, NaN without inliers in the frame.
 
@@ -60,10 +66,14 @@ def frame_offsets_px(
     ----------
     offsets, point_idx : as in ModelResiduals
     on_points : residuals (2, n) and their Jacobians (2, 3, n) in the world frame
+    sums : of each image's own pose, (I, 6, 6) and (I, 6) as `stationarity.offsets_of_sums` has them, where at hand
     """
+    out, asked = np.full(len(model.images), np.nan), distinct(frames.frame_idx)
+    if sums is not None and len(out):
+        out, is_sure = _offsets_of_sums(frames, sums, np.diff(offsets))
+        asked = distinct(frames.frame_idx[~is_sure])
     residuals, jacobian = on_points
-    out = np.full(len(model.images), np.nan)
-    for frame in np.unique(frames.frame_idx).tolist():
+    for frame in asked.tolist():
         members = np.flatnonzero(frames.frame_idx == frame)
         columns, own = [np.empty((_NUM_POSE, 2, 0))], [np.empty((2, 0))]
         for image_idx in members.tolist():
@@ -78,3 +88,25 @@ def frame_offsets_px(
             own.append(residuals[:, rows])
         out[members] = offset_px(np.concatenate(columns, axis=2), np.concatenate(own, axis=1))
     return out
+
+
+def _offsets_of_sums(
+    frames: Frames, sums: tuple[FloatArray, FloatArray], num_points: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """By image: the offset of its frame, and whether it is well above rounding.
+
+    The columns of a frame's pose are those of its images times `image_from_frame`, and their products add up.
+    """
+    order = np.argsort(frames.frame_idx, kind="stable")
+    starts = np.flatnonzero(np.append(True, np.diff(frames.frame_idx[order]) != 0))
+    is_seen = (num_points > 0)[order, None, None]
+    image_from_frame = np.where(is_seen, frames.image_from_frame[order], 0.0)  # of no inliers: a pose may be no number
+    transposed = image_from_frame.swapaxes(1, 2)
+    gram = np.add.reduceat(transposed @ sums[0][order] @ image_from_frame, starts, axis=0)
+    right = np.add.reduceat((transposed @ sums[1][order][:, :, None])[:, :, 0], starts, axis=0)
+    num = np.add.reduceat(num_points[order], starts)
+    offsets, is_sure = offsets_of_sums(gram, right, num)
+    sizes = np.diff(np.append(starts, len(order)))
+    out, sure = np.full(len(order), np.nan), np.zeros(len(order), dtype=np.bool_)
+    out[order], sure[order] = np.where(num > 0, offsets, np.nan).repeat(sizes), (is_sure | (num == 0)).repeat(sizes)
+    return out, sure

@@ -29,6 +29,7 @@ class Kept:
     missing : (m,) images that are to be `put` here
     unsure : (u,) images that are here without their pose's offset
     pose_offset_px : (I,) NaN where it is not known
+    pose_sums : (I, 6, 6) and (I, 6), see `stationarity.offsets_of_sums`; None where not all images have them
     """
 
     def __init__(self, model: SparseModel) -> None:
@@ -39,6 +40,7 @@ class Kept:
         self._counts = np.zeros((_NUM_COUNTS, num_images), dtype=np.int64)
         self.missing: IntArray = np.arange(num_images)
         self.unsure: IntArray = np.empty(0, dtype=np.int64)
+        self.pose_sums: tuple[FloatArray, FloatArray] | None = None
         found = project_scene(scene_of(model))
         if found is None:
             self.rows: IntArray = np.empty(capacity, dtype=np.int64)
@@ -58,6 +60,7 @@ class Kept:
         self._counts[: len(counts)] = counts
         self._counts[_NONFINITE] = (num_linked - counts.sum(axis=0)) * found.done
         self.missing = np.flatnonzero(~found.done)
+        self.pose_sums = (found.pose_gram, found.pose_right) if found.done.all() else None
         num = counts[_INLIERS]
         where = zip(found.extra_offsets.tolist(), num.tolist(), found.num_extra.tolist(), strict=False)
         for image_idx, (at, count, size) in enumerate(where):

@@ -238,7 +238,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     point_idx = observations.point_idx if all_in else observations.point_idx[kept.rows]
     if (frames := claimed_frames(model)) is not None:
         on_points = (kept.residuals_px, kept.point_jacobian)
-        pose_offset = frame_offsets_px(model, frames, offsets, point_idx, on_points)
+        pose_offset = frame_offsets_px(model, frames, offsets, point_idx, on_points, sums=kept.pose_sums)
     return ModelResiduals(
         offsets,
         kept.rows,

@@ -11,6 +11,7 @@ from sfm_audit.audit.cameras import unproject
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.inliers.sanity import is_sane
 from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.camera_models import BY_ID
 from sfm_audit.loaders.model import Finding, FindingCode, SparseModel
 
 _STALE_PX = 1e-3
@@ -51,10 +52,12 @@ def reprojection_errors_px(model: SparseModel, residuals: ModelResiduals) -> Flo
 
     The length of the residual; for spherical cameras the angle between the rays, times width / 2 pi.
     """
-    length = np.hypot(*residuals.residuals_px)
-    for image_idx in range(len(model.images)):
+    x, y = residuals.residuals_px  # inliers: at most 1e9 px
+    length = np.sqrt(x * x + y * y)
+    is_spherical = np.array([*(BY_ID[model_id].is_spherical for model_id in model.cameras.model_id.tolist()), False])
+    for image_idx in np.flatnonzero(is_spherical[model.images.camera_idx]).tolist():
         image, rows = model.image(image_idx), residuals.rows(image_idx)
-        if image.camera is None or not image.camera.model.is_spherical or rows.start == rows.stop:
+        if image.camera is None or rows.start == rows.stop:
             continue
         observed = unproject(
             image.camera.model, image.camera.params, model.observations.xy_px[residuals.observation_row[rows]]

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from sfm_audit.audit.cameras import project
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
+from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.joint import audit_jointly
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.loaders.model import rotation_from_quat
 
 PAIRS = dataclasses.replace(SPEC, num_images=8)
@@ -58,6 +60,31 @@ def test_the_offset_of_a_frame_is_what_moving_the_rig_would_remove(rig):
     y = np.concatenate([residuals.residuals_px[:, residuals.rows(i)].T for i in (4, 5)]).ravel()
     explained = np.linalg.lstsq(np.array(columns).T, y, rcond=None)[0] @ np.array(columns)
     assert residuals.pose_offset_px[4] == pytest.approx(np.sqrt(explained @ explained / (len(y) / 2)), rel=1e-4)
+
+
+@pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here")
+@pytest.mark.parametrize("fault", ["none", "no pose", "nothing", "two points", "mixed"])
+def test_offsets_of_frames_are_the_same_on_both_paths(rig, fault):
+    translation = rig.images.translation_cam_from_world.copy()
+    poses, point_idx = rig.images.pose_cam_from_rig.copy(), rig.observations.point_idx.copy()
+    frame_idx, offsets = rig.images.frame_idx - 1, rig.observations.offsets
+    if fault == "no pose":
+        translation[3] = poses[3] = np.nan
+    if fault == "nothing":
+        point_idx[offsets[2] : offsets[4]] = -1
+    if fault == "two points":  # do not fix the pose of their frame
+        point_idx[offsets[4] + 1 : offsets[5]] = point_idx[offsets[5] + 1 : offsets[6]] = -1
+    if fault == "mixed":
+        frame_idx = np.array([3, 1, 1, 3, 0, 2, 2, 0])
+    images = dataclasses.replace(
+        rig.images, translation_cam_from_world=translation, pose_cam_from_rig=poses, frame_idx=frame_idx
+    )
+    observations = dataclasses.replace(rig.observations, point_idx=point_idx)
+    model = dataclasses.replace(rig, images=images, observations=observations)
+    found = model_residuals(model).pose_offset_px
+    with numpy_only():
+        assert_allclose(found, model_residuals(model).pose_offset_px, rtol=1e-9)
+    assert np.isnan(found).sum() == {"nothing": 2}.get(fault, 0)
 
 
 def test_a_frame_of_one_image_is_an_image(rig):

@@ -210,6 +210,22 @@ def behind(model, image_idx, share):
     return but(model, "points", xyz_world=xyz)
 
 
+def not_projected(model):
+    """A point so near to the plane of a camera that COLMAP does not project it."""
+    image, xyz = model.image(2), model.points.xyz_world.copy()
+    quats, translation = model.images.quat_cam_from_world_wxyz.copy(), model.images.translation_cam_from_world.copy()
+    quats[2], translation[2] = (1.0, 0.0, 0.0, 0.0), 0.0
+    own = model.observations.point_idx[slice(*model.observations.offsets[2:4])]
+    xyz[own] = image.cam_from_world(xyz[own])
+    xyz[own[0]] = 0.0, 0.0, 1e-17
+    return but(
+        but(model, "points", xyz_world=xyz),
+        "images",
+        quat_cam_from_world_wxyz=quats,
+        translation_cam_from_world=translation,
+    )
+
+
 FAULTS = {
     "nothing": lambda model: model,
     "half a pixel": half_a_pixel,
@@ -218,6 +234,9 @@ FAULTS = {
     "no camera": no_camera,
     "no width": lambda model: no_size(model, "width"),
     "no height": lambda model: no_size(model, "height"),
+    "one pixel wide": lambda model: but(model, "cameras", width=np.ones(len(model.cameras), dtype=np.int64)),
+    "one not projected": not_projected,
+    "1 linked": lambda model: linked(model, 1),
     "19 linked": lambda model: linked(model, 19),
     "20 linked": lambda model: linked(model, 20),
     "20 linked, one behind": lambda model: behind(linked(model, 20), 3, 0.05),
