@@ -35,7 +35,7 @@ from sfm_audit.audit.misfit.pooled import camera_tests_of_pieces
 from sfm_audit.audit.misfit.pooled_stack import in_windows, pieces_of_joined
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.table.words import VERDICT_ORDER, Member, Verdict
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_audit.loaders.model import CameraRecord, SparseModel
 
 _MAX_WINDOW: Final = 128
@@ -118,7 +118,8 @@ class _CameraImages:
     def num_points(self) -> int:
         """Points that the images see."""
         if 8 * self.num_observations < len(self.model.points):
-            return self.tracks()[1]
+            rows = [self.residuals.rows(image_idx) for image_idx in self.image_idxs.tolist()]
+            return len(distinct(np.concatenate([self.residuals.point_idx[own] for own in rows])))
         seen = np.zeros(len(self.model.points), dtype=np.bool_)
         for image_idx in self.image_idxs.tolist():
             seen[self.residuals.point_idx[self.residuals.rows(image_idx)]] = True
@@ -127,9 +128,9 @@ class _CameraImages:
     def tracks(self) -> tuple[list[IntArray], int]:
         """Rows of each image's points in the list of this camera's points, and the length of that list."""
         parts = [self.residuals.point_idx[self.residuals.rows(int(i))] for i in self.image_idxs]
-        distinct, row = np.unique(np.concatenate(parts), return_inverse=True)
+        points, row = np.unique(np.concatenate(parts), return_inverse=True)
         ends = np.cumsum([part.size for part in parts])[:-1]
-        return [part.astype(np.int64) for part in np.split(row, ends)], distinct.size
+        return [part.astype(np.int64) for part in np.split(row, ends)], points.size
 
 
 def audit_cameras(

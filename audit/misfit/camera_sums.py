@@ -13,16 +13,19 @@ import numpy as np
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Tracks
-from sfm_audit.audit.misfit.features import FIELD_OF_FEATURE, widened, widened_columns
+from sfm_audit.audit.misfit.features import FEATURE_OF_FIELD, FIELD_OF_FEATURE, widened, widened_columns
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS
+from sfm_audit.audit.misfit.mixed import mix_of, transforms_of
+from sfm_audit.audit.misfit.outcome import MisfitTest, judged_by_chi2, not_tested, refusal
 from sfm_audit.audit.misfit.pooled import PooledNormal, PooledSolution, PooledTests, judged
-from sfm_audit.audit.misfit.stacked import profiled, ranks_of
+from sfm_audit.audit.misfit.stacked import LOST_DIGITS, LOST_OF_SMOOTH, profiled, ranks_of
 from sfm_audit.audit.misfit.sums import ModelSums
-from sfm_audit.audit.table.words import GROUPS
+from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 _POSE: Final = 6
+_SMOOTH: Final = GROUP_COLUMNS[MisfitGroup.SMOOTH]
 _MIN_OBSERVATIONS: Final = 64  # per image: of fewer the profiles of poses are more than the columns
 _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns
 _TRACKS_AT_ONCE: Final = 1 << 16  # whose scores are in memory at the same time; numpy has all
@@ -48,12 +51,18 @@ def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: 
         solution = None if first is None else _solution(first)
         if first is None or solution is None:
             return None
-        normal = first.normal
+        normal, profiles = first.normal, _profiles(first, solution)
+        mixed = None if MisfitGroup.SMOOTH in solution.transform else _mixed(source, images, first, solution, profiles)
+        if MisfitGroup.SMOOTH not in solution.transform and mixed is None:
+            return None
         z = solution.to_basis.T @ normal.on_y[: normal.num_intrinsics]
         scores = normal.on_y[normal.num_intrinsics :] - solution.on_basis.T @ z
-        meat = _meat(source, images, first, solution)
-    tests = {group: judged(group, scores, meat, normal, solution) for group in GROUPS}
-    return PooledTests(tests, normal.num_images, normal.num_observations, normal.num_tracks)
+        meat, mixed_meat = _meat(source, images, first, profiles, mixed)
+        tests = {group: judged(group, scores, meat, normal, solution) for group in solution.transform}
+        if mixed is not None:
+            tests[MisfitGroup.SMOOTH] = _judged_mixed(mixed, mixed_meat, first, solution)
+    ordered = {group: tests[group] for group in GROUPS}
+    return PooledTests(ordered, normal.num_images, normal.num_observations, normal.num_tracks)
 
 
 class _Pooled(NamedTuple):
@@ -112,7 +121,10 @@ def _first_pass(source: ModelSums, images: Sequence[int]) -> _Pooled | None:
 
 
 def _solution(first: _Pooled) -> PooledSolution | None:
-    """Profile the intrinsics, once for all images; None where digits or a rank are in doubt."""
+    """Profile the intrinsics, once for all images; None where digits or a rank are in doubt.
+
+    The smooth group alone may be left out instead.
+    """
     normal = first.normal
     k = normal.num_intrinsics
     values, vectors = np.linalg.eigh(normal.gram[:k, :k])
@@ -131,21 +143,76 @@ def _solution(first: _Pooled) -> PooledSolution | None:
         direction[k:][columns] = vectors
         with_poses = np.sqrt(np.maximum(np.einsum("ic,ij,jc->c", direction, first.subtracted, direction), 0.0))
         along = np.concatenate([direction[:k], with_poses[None]])
-        ranks, certain = ranks_of(values[None], along[None])
-        if not certain[0]:
+        is_smooth = group is MisfitGroup.SMOOTH
+        ranks, certain = ranks_of(values[None], along[None], LOST_OF_SMOOTH if is_smooth else LOST_DIGITS)
+        if not certain[0] and not is_smooth:
             return None
+        if not certain[0]:
+            continue
         kept = slice(len(values) - int(ranks[0]), None)
         transforms[group] = np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
     return PooledSolution(to_basis, on_basis, transforms)
 
 
-def _meat(source: ModelSums, images: Sequence[int], first: _Pooled, solution: PooledSolution) -> FloatArray:
-    """(42, 42) of the fields off all that was profiled, of unit length before: scores of tracks, block by block."""
+class _Mixed(NamedTuple):
+    """The smooth fields, mixed so that their digits last.
+
+    mix: (28, 28) of the features.    scores: (28,) of what is mixed.    transform: (28, r) to an orthonormal basis.
+    """
+
+    mix: FloatArray
+    scores: FloatArray
+    transform: FloatArray
+
+
+_Profiles = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def _mixed(
+    source: ModelSums, images: Sequence[int], first: _Pooled, solution: PooledSolution, profiles: _Profiles
+) -> _Mixed | None:
+    """Sum up mixed and projected smooth fields, as `audit.misfit.mixed` does; None where their rank is in doubt."""
+    k, normal = first.normal.num_intrinsics, first.normal
+    left = normal.gram[k:, k:] - solution.on_basis.T @ solution.on_basis
+    found = mix_of(left[None, _SMOOTH, _SMOOTH], normal.before[None, k:, k:][:, _SMOOTH, _SMOOTH])
+    mix = found.mix[0] * normal.scale[k:][_SMOOTH, None]
+    _, on_y, coefficients = profiles
+    of_mixed = coefficients[:, :, FEATURE_OF_FIELD[_SMOOTH]] @ mix
+    gram, scores, at = np.zeros(mix.shape), np.zeros(len(mix)), 0
+    for window in source.windows(images):
+        own = slice(at, at + len(window.images))
+        no_leverage = np.zeros((len(window.images), window.num_own, window.num_own))
+        chosen = np.arange(len(window.images))
+        mixes = np.repeat(mix[None], len(window.images), axis=0)
+        own_gram, own_scores, _ = window.mixed(no_leverage, on_y[own], chosen, mixes, of_mixed[own])
+        gram, scores, at = gram + own_gram.sum(axis=0), scores + own_scores.sum(axis=0), own.stop
+    for _, transform in transforms_of(found, gram[None]):
+        if len(transform):
+            return _Mixed(mix, scores, transform[0])
+    return None
+
+
+def _judged_mixed(mixed: _Mixed, meat: FloatArray, first: _Pooled, solution: PooledSolution) -> MisfitTest:
+    normal, transform = first.normal, mixed.transform
+    if normal.num_free - solution.to_basis.shape[1] < len(mixed.mix):
+        return not_tested(MisfitStatus.NOT_ENOUGH_EVIDENCE)
+    refused = refusal(transform.shape[1], normal.num_tracks)
+    own_meat = transform.T @ meat @ transform
+    return refused or judged_by_chi2(transform.T @ mixed.scores, own_meat, normal.num_observations)
+
+
+def _meat(
+    source: ModelSums, images: Sequence[int], first: _Pooled, profiles: _Profiles, mixed: _Mixed | None
+) -> tuple[FloatArray, FloatArray]:
+    """(42, 42) of the fields off all that was profiled, of unit length before, and (28, 28) of the mixed ones.
+
+    Scores of tracks, block by block of tracks.
+    """
     normal = first.normal
-    basis, on_y, coefficients = _profiles(first, solution)
+    basis, on_y, coefficients = profiles
     at_once = _TRACKS_AT_ONCE if kernels_in_use() else normal.num_tracks
     windows = list(source.windows(images)) if kernels_in_use() else None  # numpy's hold their features
-    meat = np.zeros((NUM_FEATURES, NUM_FEATURES))
+    meat, mixed_meat = np.zeros((NUM_FEATURES, NUM_FEATURES)), np.zeros((0, 0) if mixed is None else mixed.mix.shape)
     for start in range(0, normal.num_tracks, at_once):
         tracks = Tracks(first.track_of_point, start, min(start + at_once, normal.num_tracks))
         per_track = np.zeros((tracks.last - tracks.first, NUM_FEATURES))
@@ -155,8 +222,11 @@ def _meat(source: ModelSums, images: Sequence[int], first: _Pooled, solution: Po
             window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
             at = own.stop
         meat += per_track.T @ per_track
+        if mixed is not None:
+            own_tracks = per_track[:, FEATURE_OF_FIELD[_SMOOTH]] @ mixed.mix
+            mixed_meat += own_tracks.T @ own_tracks
     scale = normal.scale[normal.num_intrinsics :]
-    return np.asarray(widened(meat[None], first.offset[None], 0)[0] * scale * scale[:, None])
+    return widened(meat[None], first.offset[None], 0)[0] * scale * scale[:, None], mixed_meat
 
 
 def _profiles(first: _Pooled, solution: PooledSolution) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -7,8 +7,8 @@ enough to mix the fields so that all columns off N have about unit length; sums 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,45 @@ _NEAR_LIMIT: Final = 1.1  # squared singular values within this factor of the th
 _SURE_LENGTH: Final = 0.5  # squared, of the columns of the second mix, 1 up to the rounding of the first
 
 
+class Mix(NamedTuple):
+    """How to mix the smooth fields of B images, or cameras.
+
+    mix: (B, 28, 28) of unit columns.    root: (B, 28) lengths off N of what is mixed, before.
+    limit: (B,) squared singular values above it count.
+    """
+
+    mix: FloatArray
+    root: FloatArray
+    limit: FloatArray
+
+
+def mix_of(left: FloatArray, before: FloatArray) -> Mix:
+    """Mix by what sums say of the unit smooth fields: Gram matrices (B, 28, 28) off N, and before."""
+    values, vectors = np.linalg.eigh(left)
+    root = np.sqrt(np.maximum(values, _FLOOR))
+    largest = np.linalg.eigvalsh(before)[:, -1]
+    return Mix(vectors / root[:, None, :], root, np.asarray(basis.FIELD_THRESHOLD**2 * largest))
+
+
+def transforms_of(mixed: Mix, gram: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Yield images (k,) whose mixed fields have the same rank r, and transforms (k, 28, r) to an orthonormal basis.
+
+    Parameters
+    ----------
+    gram : (B, 28, 28) Gram matrices of the mixed fields; images in doubt are left out
+    """
+    finite = np.asarray(np.isfinite(gram).all(axis=(1, 2)))
+    gram = np.where(finite[:, None, None], gram, np.eye(gram.shape[1]))
+    gauge, limit = _gauged(mixed.root, mixed.limit)
+    values, vectors = np.linalg.eigh(_apart(gram, mixed.root) * gauge[:, :, None] * gauge[:, None, :])
+    ranks, certain = _ranks_of(np.asarray(values), limit)
+    certain &= finite
+    for rank in np.unique(ranks[certain]).tolist():
+        chosen = np.flatnonzero(certain & (ranks == rank))
+        transform, good = _orthonormal(gram[chosen], gauge[chosen], values[chosen], vectors[chosen], rank)
+        yield chosen[good], transform[good]
+
+
 def smooth_tests(
     found: Profiled, images: IntArray, num_own: int, sums: MixedSums, sizes: Sizes
 ) -> list[MisfitTest | None]:
@@ -40,29 +79,17 @@ def smooth_tests(
     num_own : q, the first columns of ``found``, which are profiled        sizes : of all images
     """
     left, on_basis = found.left[images][:, _SMOOTH, _SMOOTH], found.on_basis[images][:, :, _SMOOTH]
-    values, vectors = np.linalg.eigh(left)
-    root = np.sqrt(np.maximum(values, _FLOOR))
-    mix = vectors / root[:, None, :]  # of unit columns
+    mixed = mix_of(left, left + on_basis.swapaxes(1, 2) @ on_basis)
     scale = found.scale[images]
-    coefficients = found.coefficients[images][:, :, _SMOOTH] @ mix * scale[:, :num_own, None]
-    largest = np.asarray(np.linalg.eigvalsh(left + on_basis.swapaxes(1, 2) @ on_basis)[:, -1])
-    gram, scores, meat = sums(images, mix * scale[:, num_own:, None][:, _SMOOTH], coefficients)
-    joined = np.concatenate([gram, meat, scores[:, None]], axis=1)
-    finite = np.asarray(np.isfinite(joined).all(axis=(1, 2)))
-    gram = np.where(finite[:, None, None], gram, np.eye(gram.shape[1]))
-    gauge, limit = _gauged(root, basis.FIELD_THRESHOLD**2 * largest)
-    values, vectors = np.linalg.eigh(_apart(gram, root) * gauge[:, :, None] * gauge[:, None, :])
-    ranks, certain = _ranks_of(np.asarray(values), limit)
-    certain &= finite
+    coefficients = found.coefficients[images][:, :, _SMOOTH] @ mixed.mix * scale[:, :num_own, None]
+    gram, scores, meat = sums(images, mixed.mix * scale[:, num_own:, None][:, _SMOOTH], coefficients)
     out: list[MisfitTest | None] = [None] * len(images)
-    for rank in np.unique(ranks[certain]).tolist():
-        chosen = np.flatnonzero(certain & (ranks == rank))
-        transform, is_good = _orthonormal(gram[chosen], gauge[chosen], values[chosen], vectors[chosen], rank)
+    for chosen, transform in transforms_of(mixed, gram):
         own = sizes.of(images[chosen])
         own_meat = transform.swapaxes(1, 2) @ meat[chosen] @ transform
         judged = judged_by_f_together((scores[chosen, None] @ transform)[:, 0], own_meat, own)
-        for b, good, num, test in zip(chosen.tolist(), is_good, own.num_clusters.tolist(), judged, strict=True):
-            out[b] = (refusal(rank, num) or test) if good else None
+        for b, num, test in zip(chosen.tolist(), own.num_clusters.tolist(), judged, strict=True):
+            out[b] = refusal(transform.shape[2], num) or test
     return out
 
 
@@ -95,11 +122,11 @@ def _ranks_of(values: FloatArray, limit: FloatArray) -> tuple[IntArray, BoolArra
 
 def _orthonormal(
     gram: FloatArray, gauge: FloatArray, values: FloatArray, vectors: FloatArray, rank: int
-) -> tuple[FloatArray, list[bool]]:
+) -> tuple[FloatArray, BoolArray]:
     """(B, 28, r) what makes an orthonormal basis of the mixed columns, and where that came out."""
     kept = slice(values.shape[1] - rank, None)
     first = gauge[:, :, None] * vectors[:, :, kept] / np.sqrt(values[:, None, kept])
     lengths, again = np.linalg.eigh(first.swapaxes(1, 2) @ gram @ first)
-    good = lengths[:, 0] > _SURE_LENGTH
+    good = np.asarray(lengths[:, 0] > _SURE_LENGTH)
     lengths = np.where(good[:, None], lengths, 1.0)
-    return np.asarray(first @ again / np.sqrt(lengths)[:, None, :]), good.tolist()
+    return np.asarray(first @ again / np.sqrt(lengths)[:, None, :]), good

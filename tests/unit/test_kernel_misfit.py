@@ -7,74 +7,30 @@ import math
 
 import numpy as np
 import pytest
-from misfit_reference import PARAMS
-from model_writer import Camera, Image, Model, Point, write_binary
+from misfit_models import LENSES, NUMBERS, SURE, assert_same, model_of, nearly_flat
 from numpy.testing import assert_allclose
 
-from sfm_audit import open_model
-from sfm_audit.audit.cameras import project
 from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, Tracks, misfit_sums, misfit_tracks
+from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Observed, misfit_sums
 from sfm_audit.audit.misfit import (
-    GROUPS,
     MisfitGroup,
-    MisfitStatus,
-    camera_sums,
-    camera_tests,
     candidate_fields,
     coincident_keypoints,
     mixed,
     nuisance_columns,
     prepare,
-    projected_design,
 )
 from sfm_audit.audit.misfit import images as images_module
-from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.features import affine_offset, image_features, sums_of, widened, widened_columns
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
 from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.audit.misfit.outcome import judged_by_f
 from sfm_audit.audit.misfit.stacked import Sizes, judged_by_f_together, profiled, ranks_of
 from sfm_audit.audit.misfit.sums import ModelSums
-from sfm_audit.loaders.camera_models import BY_NAME
-from sfm_audit.loaders.model import moved
 
 compiled = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels")
-LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "EUCM")
-LENSES = (*LENSES, "RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE", "DIVISION")
-SURE = LENSES[:3]  # of the others the smooth fields nearly are columns of the image's own fit
-NUMBERS = (300, 130, 65)
-_SIZE = (640, 480)
-
-
-def model_of(folder, name, numbers=NUMBERS, *, seed=1, sigma=0.5, shared=False, twins=0, centre=(317.0, 243.5)):
-    """A model of images with so many points each; of ``twins`` points the keypoint is that of the point before."""
-    rng = np.random.default_rng(seed)
-    lens = BY_NAME[name]
-    params = np.array([*(500.0, 502.0)[: len(lens.focal_idxs)], *centre, *PARAMS[name]])
-    xyz = rng.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 9.0), (max(numbers), 3))
-    images, tracks = [], [[] for _ in xyz]
-    for k, number in enumerate(numbers):
-        quat = np.array([1.0, *rng.normal(0.0, 0.02, 3)]) * (1.0 + 0.01 * k)  # no unit quaternion, as stored
-        shift = np.array([0.3 - 0.3 * k, 0.1 * k, 0.0])
-        xy = project(lens, params, moved(quat, shift, xyz)) + rng.normal(0.0, sigma, (len(xyz), 2))
-        xy[1 : 2 * twins : 2] = np.floor(xy[0 : 2 * twins : 2]) + 0.5
-        seen = np.sort(rng.permutation(len(xyz))[:number])
-        points2d = tuple((float(x), float(y), int(p) + 1) for (x, y), p in zip(xy[seen], seen, strict=True))
-        for row, point in enumerate(seen.tolist()):
-            tracks[point].append((k + 1, row))
-        pose = (*map(float, quat), *map(float, shift))
-        images.append(Image(k + 1, f"{k}.jpg", points2d, pose, 1 if shared else k + 1))
-    cameras = [Camera(k + 1, lens.model_id, *_SIZE, tuple(map(float, params))) for k in range(len(numbers))]
-    points = [
-        Point(k + 1, tuple(own), tuple(map(float, at)), 0.5)
-        for k, (own, at) in enumerate(zip(tracks, xyz, strict=True))
-    ]
-    written = Model(tuple(cameras[: 1 if shared else len(cameras)]), tuple(images), tuple(points))
-    model = open_model(write_binary(folder, written))
-    return model, model_residuals(model)
 
 
 def window_of(model, residuals, images=None):
@@ -142,16 +98,6 @@ def alone(model, residuals, image):
     return nuisance, prepared.test(own.residuals_px)
 
 
-def assert_same(found, expected):
-    assert tuple(found) == GROUPS
-    for group in GROUPS:
-        test, other = found[group], expected[group]
-        assert (test.rank, test.status) == (other.rank, other.status), group
-        if test.status is MisfitStatus.TESTED:
-            assert_allclose(test.p, other.p, rtol=5e-6, err_msg=group)
-            assert_allclose(test.px, other.px, rtol=5e-6, atol=1e-8, err_msg=group)
-
-
 def test_features_span_the_candidate_fields(tmp_path):
     """Fields in the units of the sums are candidate fields times a number."""
     model, residuals = model_of(tmp_path, "OPENCV", (200,))
@@ -181,15 +127,6 @@ def test_the_unit_of_the_world_does_not_matter(tmp_path, scale):
     assert sorted(found) == [0, 1]
     for image, own in found.items():
         assert_same(own.tests, expected[image].tests)
-
-
-def nearly_flat(folder, numbers, k1, **options):
-    """With next to no distortion its column nearly is a polynomial of the predicted point, which is a smooth field."""
-    model, _ = model_of(folder, "SIMPLE_RADIAL", numbers, centre=(320.0, 240.0), **options)
-    params = model.cameras.params.copy()
-    params[3::4] = k1
-    model = dataclasses.replace(model, cameras=dataclasses.replace(model.cameras, params=params))
-    return model, model_residuals(model)
 
 
 @pytest.mark.parametrize("path", [pytest.param("compiled", marks=compiled), "numpy"])
@@ -326,64 +263,3 @@ def test_groups_judged_together_are_judged_as_alone():
         assert found[b] is not None
         assert_allclose(found[b][:2], expected[:2], rtol=1e-9)
         assert found[b][2:] == expected[2:]
-
-
-def old_tests(model, residuals, images):
-    """The tests of a camera on images, one after the other, fields in memory."""
-    points = np.unique(residuals.point_idx, return_inverse=True)[1]
-
-    def design(k):
-        own = image_inliers(model, residuals, images[k])
-        return projected_design(own.camera, own.projected, own.residuals_px, points[residuals.rows(images[k])])
-
-    return camera_tests(design, len(images), int(points.max()) + 1)
-
-
-@pytest.mark.parametrize("path", [pytest.param("compiled", marks=compiled), "numpy"])
-@pytest.mark.parametrize("name", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "PINHOLE", "FOV", "DIVISION"])
-def test_a_shared_camera_is_tested_from_sums_as_from_its_columns(tmp_path, monkeypatch, name, path):
-    model, residuals = model_of(tmp_path, name, (300, 130, 65, 200), shared=True, twins=20)
-    monkeypatch.setattr(camera_sums, "_TRACKS_AT_ONCE", 70)
-    images = [0, 1, 3]
-    if path == "numpy":
-        with numpy_only():
-            found = camera_tests_of_sums(model, residuals, images)
-    else:
-        found = camera_tests_of_sums(model, residuals, images)
-    expected = old_tests(model, residuals, images)
-    assert found is not None
-    for counts in (found, expected):
-        assert (counts.num_images, counts.num_observations, counts.num_tracks) == (3, 630, 300)
-    assert {test.status for test in found.tests.values()} >= {MisfitStatus.TESTED}
-    assert_same(found.tests, expected.tests)
-
-
-def test_shared_cameras_in_doubt_are_left_out(tmp_path):
-    model, residuals = model_of(tmp_path / "few", "SIMPLE_RADIAL", (300, 2, 200), shared=True)
-    assert camera_tests_of_sums(model, residuals, [0, 1, 2]) is None
-    assert camera_tests_of_sums(model, residuals, [0, 2]) is not None
-    assert camera_tests_of_sums(model, residuals, []) is None
-    model, residuals = model_of(tmp_path / "small", "SIMPLE_RADIAL", (60, 60), shared=True)
-    assert camera_tests_of_sums(model, residuals, [0, 1]) is None
-    flat, residuals = nearly_flat(tmp_path / "flat", (200, 150), 1e-5, shared=True)
-    assert camera_tests_of_sums(flat, residuals, [0, 1]) is None
-
-
-@compiled
-def test_the_kernel_adds_to_no_track_that_is_not_asked_for(tmp_path):
-    model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (100, 80), shared=True)
-    source = ModelSums(model, residuals)
-    window = source.window([0, 1], [source.camera(0)] * 2)
-    rng = np.random.default_rng(1)
-    profile = rng.normal(size=(2, 9, 8)) * 1e-4, rng.normal(size=(2, 8)) * 1e-4, rng.normal(size=(2, 8, NUM_FEATURES))
-    of_point, num_tracks = source.tracks([0, 1])
-    everything = np.zeros((num_tracks, NUM_FEATURES))
-    assert misfit_tracks(source.observed, window, profile, Tracks(of_point, 0, num_tracks), everything)
-    part = np.zeros((20, NUM_FEATURES))
-    assert misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 50), part)
-    assert (part == everything[30:50]).all()
-    assert (part != 0).any(axis=1).all()
-    with pytest.raises(ValueError, match="per_track"):
-        misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 51), part)
-    with pytest.raises(ValueError, match="tracks of shape"):
-        misfit_tracks(source.observed, window, profile, Tracks(of_point[1:], 30, 50), part)
