@@ -21,6 +21,7 @@ _MAX_ITERATIONS = 60
 _STEP = 1.0 / 32.0  # node distance of the quantile tables in w
 _TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
 _NUM_CELLS = round(_TABLE_END / _STEP)
+_TINY = float(np.finfo(np.float64).tiny)
 LAST_STEP = 1e-6  # in ln f
 MIN_SLOPE = 1e-3  # of the robust variance in ln f, at which a step of Newton's is one
 _MANY, _EVERY = 256, 8  # observations, from which on every 8th says where to begin
@@ -81,6 +82,7 @@ class StudentToNormal:
     """
 
     def __init__(self, nu_values: FloatArray) -> None:
+        """Tabulate; coefficients: (v * 193, 4) of the cubics of z / w in cells of w, the last of which begins at 6."""
         self.nu_values = nu_values
         nodes: FloatArray = np.arange(_NUM_CELLS + 2, dtype=np.float64) * _STEP
         ratio = np.empty((len(nu_values), nodes.size))
@@ -91,34 +93,29 @@ class StudentToNormal:
         left_slope, right_slope = slope[:, :-1] * _STEP, slope[:, 1:] * _STEP
         rise = right - left
         cubic = [left, left_slope, 3.0 * rise - 2.0 * left_slope - right_slope, left_slope + right_slope - 2.0 * rise]
-        self._coefficients = np.stack(cubic, axis=-1).reshape(-1, 4)
-
-    @property
-    def coefficients(self) -> FloatArray:
-        """Of the cubics (v * 193, 4) of z / w in cells of w, lowest power first; the last begins at w = 6."""
-        return self._coefficients
+        self.coefficients: FloatArray = np.stack(cubic, axis=-1).reshape(-1, 4)
 
     def __call__(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         """Transform t (m,) with degrees of freedom nu (m,) = nu_values[nu_row]."""
         return self.growing(t, nu_row, nu)[0]
 
     def growing(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z (m,) and d z / d ln t, which is NaN where |w| > 6."""
+        """Return z (m,) and d z / d ln t, which is 0 where |w| > 6 and nobody has asked."""
         t_sq = t * t
         w = np.sqrt(nu * np.log1p(t_sq / nu))
         cell_position = w * (1.0 / _STEP)
         outside = np.flatnonzero(cell_position >= _NUM_CELLS)
         np.minimum(cell_position, _NUM_CELLS, out=cell_position)
         cell = cell_position.astype(np.int64)
-        c0, c1, c2, c3 = self._coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0).T
-        fraction = cell_position - cell
+        c0, c1, c2, c3 = self.coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0).T
+        fraction = np.subtract(cell_position, cell, out=cell_position)
         ratio = ((c3 * fraction + c2) * fraction + c1) * fraction + c0
-        steepness = ((3.0 * c3 * fraction + 2.0 * c2) * fraction + c1) * (1.0 / _STEP)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            growth = (ratio + w * steepness) * np.where(w > 0.0, nu * t_sq / ((nu + t_sq) * w), 0.0)
+        growth = ((3.0 * c3 * fraction + 2.0 * c2) * fraction + c1) * (w * (1.0 / _STEP))
+        growth += ratio
+        growth *= nu * t_sq / ((nu + t_sq) * np.maximum(w, _TINY))  # d w / d ln t
         z = np.copysign(w * ratio, t)
         if outside.size:
-            z[outside], growth[outside] = student_to_normal(t[outside], nu[outside]), math.nan
+            z[outside], growth[outside] = student_to_normal(t[outside], nu[outside]), 0.0
         return z, np.copysign(growth, t)
 
 
@@ -171,7 +168,7 @@ class StandardisedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """ln f, the step from there, z and d z / d ln t (m, 2) there."""
+    """ln f, the step from there, z and d z / d ln t (2, m) there."""
 
     log_f: float
     move: float
@@ -182,21 +179,22 @@ class _Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackStandardiser:
-    """(5) for the images of one model: tables for x (nu) and for y given x (nu + 1)."""
+    """(5) for the images of one model: tables for x (nu), and behind them those for y given x (nu + 1)."""
 
     prediction: Prediction
-    first: StudentToNormal
-    second: StudentToNormal
+    to_normal: StudentToNormal
 
     @classmethod
     def build(cls, prediction: Prediction) -> TrackStandardiser:
         """Tabulate the transformations that the model's degrees of freedom need."""
-        return cls(prediction, StudentToNormal(prediction.nu_values), StudentToNormal(prediction.nu_values + 1.0))
+        nu = prediction.nu_values
+        return cls(prediction, StudentToNormal(np.concatenate([nu, nu + 1.0])))
 
     @property
     def tables(self) -> tuple[FloatArray, FloatArray]:
         """The coefficients of both transformations."""
-        return self.first.coefficients, self.second.coefficients
+        first, second = np.split(self.to_normal.coefficients, 2)
+        return first, second
 
     def standardise(self, whitened_px: FloatArray, rows: IntArray | slice) -> StandardisedImage:
         """Solve the image's factor f and return z at it.
@@ -224,18 +222,17 @@ class TrackStandardiser:
         found = self._solve((t, nu_row, nu), start, LAST_STEP)
         z = found.z - found.growth * found.move
         log_f = found.log_f + found.move
-        row, axis = np.nonzero(np.isnan(found.growth))
+        axis, row = np.nonzero((found.growth == 0.0) & (z != 0.0))
         if row.size:
-            z[row, axis] = self.transform(t[:, row] * math.exp(-log_f), nu_row[row], nu[row])[0][
-                np.arange(row.size), axis
-            ]
-        return StandardisedImage(z, math.exp(log_f), found.converged)
+            exact = self.transform(t[:, row] * math.exp(-log_f), nu_row[row], nu[row])[0]
+            z[axis, row] = exact[axis, np.arange(row.size)]
+        return StandardisedImage(np.ascontiguousarray(z.T), math.exp(log_f), found.converged)
 
     def _solve(self, image: tuple[FloatArray, Int32Array, FloatArray], log_f: float, tolerance: float) -> _Solution:
         """Newton in ln f from ``log_f`` until a step is smaller than ``tolerance``; that step is not taken."""
         t, nu_row, nu = image
         low, high = -math.inf, math.inf
-        z, growth = np.empty((0, 2)), np.empty((0, 2))
+        z, growth = np.empty((2, 0)), np.empty((2, 0))
         for _ in range(_MAX_ITERATIONS):
             z, growth = self.transform(t * math.exp(-log_f), nu_row, nu)
             excess, slope = robust_excess(z, growth)
@@ -250,27 +247,27 @@ class TrackStandardiser:
         """Return z and d z / d ln t (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m)."""
         flat = np.ascontiguousarray(t.transpose(1, 0, 2)).reshape(2, -1)
         z, growth = self.transform(flat, nu_row.reshape(-1), nu.reshape(-1))
-        return z.reshape(*nu.shape, 2), growth.reshape(*nu.shape, 2)
+        return z.reshape(2, *nu.shape).transpose(1, 2, 0), growth.reshape(2, *nu.shape).transpose(1, 2, 0)
 
     def transform(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z and d z / d ln t (m, 2) of t (2, m) with the degrees of freedom nu (m,) = nu_values[nu_row]."""
-        z, growth = np.empty((t.shape[1], 2)), np.empty((t.shape[1], 2))
+        """Return z and d z / d ln t (2, m) of t (2, m) with the degrees of freedom nu (m,) = nu_values[nu_row]."""
         rest = nu + t[0] * t[0]
-        z[:, 0], growth[:, 0] = self.first.growing(t[0], nu_row, nu)
-        z[:, 1], growth[:, 1] = self.second.growing(t[1] * np.sqrt((nu + 1.0) / rest), nu_row, nu + 1.0)
-        growth[:, 1] *= nu / rest  # the scale of y grows with x
+        given = np.stack([t[0], t[1] * np.sqrt((nu + 1.0) / rest)])
+        rows = np.stack([nu_row, nu_row + len(self.to_normal.nu_values) // 2])
+        both = self.to_normal.growing(given.reshape(-1), rows.reshape(-1), np.stack([nu, nu + 1.0]).reshape(-1))
+        z, growth = both[0].reshape(2, -1), both[1].reshape(2, -1)
+        growth[1] *= nu / rest  # the scale of y grows with x
         return z, growth
 
 
 def robust_excess(z: FloatArray, growth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """mean(min(z^2, c^2)) - kappa of each of (..., m, 2), and minus its derivative in ln f."""
-    sq = z * z
-    inside: BoolArray = sq < CUTOFF**2
-    size = sq.shape[-2] * sq.shape[-1]
-    axes = (-2, -1)
-    unclipped = np.where(inside, sq, 0.0).sum(axis=axes) / size
-    clipped = CUTOFF**2 * (1.0 - np.count_nonzero(inside, axis=axes) / size)
-    return unclipped + clipped - CONSISTENCY, 2.0 * np.where(inside, z * growth, 0.0).sum(axis=axes) / size
+    """mean(min(z^2, c^2)) - kappa over the last two axes, and minus its derivative in ln f; growth: d z / d ln t."""
+    inside: BoolArray = z * z < CUTOFF**2
+    size = z.shape[-2] * z.shape[-1]
+    unclipped = np.where(inside, z, 0.0)
+    clipped = 1.0 - np.count_nonzero(inside, axis=(-2, -1)) / size
+    mass, falls = (np.einsum("...ij,...ij->...", unclipped, other) / size for other in (z, growth))
+    return mass + CUTOFF**2 * clipped - CONSISTENCY, 2.0 * falls
 
 
 def _inside(x: float, step: float, low: float, high: float) -> float:
