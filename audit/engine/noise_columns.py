@@ -13,7 +13,7 @@ from sfm_audit.audit.decision.measured import MeasuredNoise
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.stack import constant_noises, track_noises
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise
-from sfm_audit.audit.normality import NormalityTests, normality_tests_of
+from sfm_audit.audit.normality import normality_columns_of
 from sfm_audit.audit.table.arrow import Column
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
@@ -35,8 +35,6 @@ _CONSTANT: Final = {
     "kurtosis_constant": "kurtosis_excess",
 }
 _noise_of: Final = attrgetter(*_NOISE)
-_tests_of: Final = attrgetter("num_values", *_CHOSEN)
-_constant_tests_of: Final = attrgetter(*_CONSTANT.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,22 +127,16 @@ def _noises(
 
 def _fitted(noises: Sequence[tuple[ImageNoise, ImageNoise]]) -> NoiseColumns:
     chosen = [each for _, each in noises]
-    of_chosen = normality_tests_of([each.z for each in chosen])
+    of_chosen = normality_columns_of([each.z for each in chosen])
     of_constant = of_chosen
     if any(each is not constant for constant, each in noises):
-        of_constant = normality_tests_of([constant.z for constant, _ in noises])
+        of_constant = normality_columns_of([constant.z for constant, _ in noises])
     return NoiseColumns(
         np.array([len(each.z) for each in chosen], dtype=np.int64),
         np.array([np.isfinite(each.z).all() for each in chosen], dtype=bool),
         np.array([constant.sigma_constant_px for constant, _ in noises], dtype=np.float64),
         np.array([each.converged for each in chosen], dtype=bool),
-        _numbers(chosen, _noise_of, len(_NOISE)),
-        _numbers(of_chosen, _tests_of, 1 + len(_CHOSEN)),
-        _numbers(of_constant, _constant_tests_of, len(_CONSTANT)),
+        np.array([_noise_of(each) for each in chosen], dtype=np.float64).reshape(-1, len(_NOISE)),
+        np.stack([of_chosen[name] for name in ("num_values", *_CHOSEN)], axis=1, dtype=np.float64),
+        np.stack([of_constant[name] for name in _CONSTANT.values()], axis=1, dtype=np.float64),
     )
-
-
-def _numbers(
-    records: Sequence[ImageNoise] | Sequence[NormalityTests], numbers_of: attrgetter[tuple[float, ...]], count: int
-) -> FloatArray:
-    return np.array([numbers_of(each) for each in records], dtype=np.float64).reshape(-1, count)

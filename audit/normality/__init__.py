@@ -10,7 +10,7 @@ from sfm_audit.audit.normality.distances import ks, ks_fitted, ks_norm, ks_norm_
 from sfm_audit.audit.normality.moments import Shape, dagostino_pearson, sample_shape
 from sfm_audit.audit.normality.outcome import Outcome
 from sfm_audit.audit.normality.shapiro import shapiro_wilk, thin_observations
-from sfm_audit.audit.normality.stack import normality_tests_of
+from sfm_audit.audit.normality.stack import normality_columns_of, normality_tests_of
 
 __all__ = [
     "NormalityTests",
@@ -21,6 +21,7 @@ __all__ = [
     "ks_fitted",
     "ks_norm",
     "ks_norm_unscaled",
+    "normality_columns_of",
     "normality_tests",
     "normality_tests_of",
     "sample_shape",

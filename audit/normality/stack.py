@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from sfm_audit.audit.normality.statistics import sample_statistics
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _Columns = dict[str, FloatArray]
+_Numbers = TypeVar("_Numbers", FloatArray, IntArray)
 
 
 def normality_tests_of(samples: Sequence[FloatArray]) -> list[NormalityTests]:
@@ -26,20 +28,41 @@ def normality_tests_of(samples: Sequence[FloatArray]) -> list[NormalityTests]:
     The numbers are those of `normality_tests` to rounding (sums are added in another order). Samples that are not
     finite, all equal or beyond the range of fourth powers are left to it.
     """
+    columns = normality_columns_of(samples)
+    names = list(columns)
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [NormalityTests(**dict(zip(names, row, strict=True))) for row in rows]
+
+
+def normality_columns_of(samples: Sequence[FloatArray]) -> dict[str, FloatArray | IntArray]:
+    """Return the fields of `NormalityTests` (B,) of the samples by name, as `normality_tests_of` does."""
     statistics, found = sample_statistics(samples)
-    usual = np.flatnonzero(found)
-    num_points = np.array([len(samples[k]) for k in usual.tolist()], dtype=np.int64)
-    together = _tests({name: column[usual] for name, column in statistics.items()}, num_points)
-    out = dict(zip(usual.tolist(), together, strict=True))
-    return [out[k] if k in out else normality_tests(z) for k, z in enumerate(samples)]
+    num_points = np.array([len(z) for z in samples], dtype=np.int64)
+    usual = found if found.all() else np.flatnonzero(found)
+    own = statistics if found.all() else {name: column[usual] for name, column in statistics.items()}
+    counts, numbers = _tests(own, num_points[usual])
+    if not found.all():
+        counts = {name: _spread(column, usual, len(samples)) for name, column in counts.items()}
+        numbers = {name: _spread(column, usual, len(samples)) for name, column in numbers.items()}
+    for k in np.flatnonzero(~found).tolist():
+        single = normality_tests(samples[k])
+        for columns in (counts, numbers):
+            for name, column in columns.items():
+                column[k] = getattr(single, name)
+    return {**counts, **numbers}
 
 
-def _tests(statistics: _Columns, num_points: IntArray) -> list[NormalityTests]:
-    """Tests of samples of so many points (B,) by their statistics."""
-    if not num_points.size:
-        return []
+def _spread(column: _Numbers, rows: IntArray | BoolArray, size: int) -> _Numbers:
+    """(size,) with the column in these rows."""
+    out = np.zeros(size, dtype=column.dtype)
+    out[rows] = column
+    return cast("_Numbers", out)
+
+
+def _tests(statistics: _Columns, num_points: IntArray) -> tuple[dict[str, IntArray], _Columns]:
+    """Tests of samples of so many points (B,) by their statistics: counts, and numbers."""
     num_values = 2 * num_points
-    step = -(-num_values // MAX_VALUES)
+    step = np.maximum(-(-num_values // MAX_VALUES), 1)
     thinned = np.where(num_values > MIN_VALUES, 2 * -(-num_points // step), 0)
     has_fit, has_shape = num_values >= MIN_VALUES_FITTED, num_values >= MIN_VALUES_DAGOSTINO
     columns: _Columns = {"ks_stat": statistics["ks"], "ks_norm_unscaled_stat": statistics["ks_norm_unscaled"]}
@@ -57,12 +80,7 @@ def _tests(statistics: _Columns, num_points: IntArray) -> list[NormalityTests]:
     columns["dap_stat"] = _where(has_shape, k2)
     columns["dap_p"] = np.exp(-0.5 * columns["dap_stat"])
     columns["sw_stat"], columns["sw_p"] = shapiro_wilk_of(statistics, thinned)
-    names = list(columns)
-    rows = np.stack(list(columns.values()), axis=1).tolist()
-    return [
-        NormalityTests(num_values=values, sw_num_values=used, **dict(zip(names, row, strict=True)))
-        for values, used, row in zip(num_values.tolist(), thinned.tolist(), rows, strict=True)
-    ]
+    return {"num_values": num_values, "sw_num_values": thinned}, columns
 
 
 def _where(holds: BoolArray, values: FloatArray) -> FloatArray:

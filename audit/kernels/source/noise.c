@@ -212,7 +212,8 @@ INLINE int64_t bits_of(double x)
 INLINE double order_statistic(int64_t n, const double *x, int64_t rank, double *spare)
 {
     int64_t left = n;
-    memcpy(spare, x, (size_t)n * sizeof *x);
+    for (int64_t i = 0; i < n; i++)
+        spare[i] = x[i] + 0.0; /* -0 has other bits than 0 */
     for (;;) {
         double least, most;
         int32_t count[257] = {0};

@@ -94,6 +94,15 @@ static void sort(int64_t n, const double *x, Room *room)
         merge_sort(n, out, room->scratch);
         return;
     }
+    for (int pass = 0; pass < 2 && n > 0; pass++) { /* most are next to their place: these take no branches */
+        double largest = out[0];
+        for (int64_t k = 1; k < n; k++) {
+            const double value = out[k];
+            out[k - 1] = value < largest ? value : largest;
+            largest = value < largest ? largest : value;
+        }
+        out[n - 1] = largest;
+    }
     for (int64_t k = 1; k < n; k++) {
         const double value = out[k];
         int64_t at = k;
