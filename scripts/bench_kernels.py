@@ -28,6 +28,7 @@ from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only, path_taken
 from sfm_audit.audit.misfit.camera_sums import camera_tests_of_sums
 from sfm_audit.audit.misfit.images import misfit_of_images
+from sfm_audit.audit.misfit.sums import ModelSums
 from sfm_audit.audit.witnesses.asking import ask
 from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders import open_model
@@ -51,14 +52,14 @@ def consistency(model: SparseModel) -> Callable[[], object]:
 def misfit(model: SparseModel) -> Callable[[], object]:
     """Misfit tests of all images, as the model stands."""
     residuals = model_residuals(model)
-    return lambda: misfit_of_images(model, residuals, range(len(model.images)))
+    return lambda: misfit_of_images(ModelSums(model, residuals), range(len(model.images)))
 
 
 def cameras(model: SparseModel) -> Callable[[], object]:
     """Misfit tests of the first camera, pooled over its images."""
     residuals = model_residuals(model)
     images = np.flatnonzero(model.images.camera_idx == 0).tolist()
-    return lambda: camera_tests_of_sums(model, residuals, images)
+    return lambda: camera_tests_of_sums(ModelSums(model, residuals), images)
 
 
 def spread(model: SparseModel) -> Callable[[], object]:

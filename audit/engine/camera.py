@@ -34,8 +34,9 @@ from sfm_audit.audit.misfit.in_parts import AT_ONCE, PartedImage, camera_tests_i
 from sfm_audit.audit.misfit.pooled import camera_tests_of_pieces
 from sfm_audit.audit.misfit.pooled_stack import in_windows, pieces_of_joined
 from sfm_audit.audit.misfit.significance import UNTESTED, Significance
+from sfm_audit.audit.misfit.sums import ModelSums
 from sfm_audit.audit.table.words import VERDICT_ORDER, Member, Verdict
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel
 
 _MAX_WINDOW: Final = 128
@@ -115,16 +116,6 @@ class _CameraImages:
         """Inliers of all images."""
         return int(np.diff(self.residuals.offsets)[self.image_idxs].sum())
 
-    def num_points(self) -> int:
-        """Points that the images see."""
-        if 8 * self.num_observations < len(self.model.points):
-            rows = [self.residuals.rows(image_idx) for image_idx in self.image_idxs.tolist()]
-            return len(distinct(np.concatenate([self.residuals.point_idx[own] for own in rows])))
-        seen = np.zeros(len(self.model.points), dtype=np.bool_)
-        for image_idx in self.image_idxs.tolist():
-            seen[self.residuals.point_idx[self.residuals.rows(image_idx)]] = True
-        return int(np.count_nonzero(seen))
-
     def tracks(self) -> tuple[list[IntArray], int]:
         """Rows of each image's points in the list of this camera's points, and the length of that list."""
         parts = [self.residuals.point_idx[self.residuals.rows(int(i))] for i in self.image_idxs]
@@ -158,7 +149,8 @@ def audit_cameras(
     """
     audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
     groups = _groups_of(model, residuals, audited)
-    tests = [_pooled(group.only(holds), quality) for group in groups]
+    source = ModelSums(model, residuals)
+    tests = [_pooled(source, group.only(holds), quality) for group in groups]
     significance = Significance.of(tests)
     out = []
     for k, group in enumerate(groups):
@@ -175,7 +167,7 @@ def audit_cameras(
             alpha=alpha,
             tau_px=tau,
         )
-        counts = group.num_points(), num_observations
+        counts = len(source.points_of(group.image_idxs.tolist())), num_observations
         out.append(CameraAudit(group.camera, group.image_idxs, *counts, tests[k], misfit, advice))
     return out
 
@@ -192,14 +184,14 @@ def _groups_of(model: SparseModel, residuals: ModelResiduals, image_idxs: IntArr
     ]
 
 
-def _pooled(group: _CameraImages, quality: Sequence[CameraQuality | None]) -> MisfitTests:
+def _pooled(source: ModelSums, group: _CameraImages, quality: Sequence[CameraQuality | None]) -> MisfitTests:
     """The tests of all images of a camera together; of the image alone where it has one."""
     if not len(group.image_idxs):
         return UNTESTED
     own = quality[int(group.image_idxs[0])]
     if len(group.image_idxs) == 1 and own is not None:
         return own.misfit
-    found = camera_tests_of_sums(group.model, group.residuals, group.image_idxs.tolist())
+    found = camera_tests_of_sums(source, group.image_idxs.tolist())
     return (group.tests(group.camera, *group.tracks()) if found is None else found).tests
 
 

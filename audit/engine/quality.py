@@ -27,6 +27,7 @@ from sfm_audit.audit.kernels.spread import Inliers, image_spread
 from sfm_audit.audit.misfit import MisfitTests, nuisance_columns
 from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
+from sfm_audit.audit.misfit.sums import ModelSums
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel, moved
 
@@ -53,10 +54,11 @@ def quality_of_images(
     by_image = [shapes.get(int(model.images.camera_idx[image_idx])) for image_idx in images]
     num_inliers = np.diff(residuals.offsets)[images]
     asked = [place for place, shape in enumerate(by_image) if num_inliers[place] and shape is not None]
+    source = ModelSums(model, residuals)
     for places in _in_turns(asked, num_inliers):
         own, of_images = [images[place] for place in places], [shape for place in places if (shape := by_image[place])]
         seen, depth = spread_of_images([shape.camera for shape in of_images], model, residuals, own, grid)
-        misfits, sums = _sums_of(of_images, model, residuals, own, depth)
+        misfits, sums = _sums_of(of_images, source, own, depth)
         for place, quality in zip(places, qualities_of(of_images, misfits, sums, seen, sigma_px[own]), strict=True):
             out[place] = quality
     return out
@@ -83,17 +85,13 @@ def _shapes_of(model: SparseModel, image_idxs: Sequence[int]) -> dict[int, Camer
 
 
 def _sums_of(
-    shapes: Sequence[CameraShape],
-    model: SparseModel,
-    residuals: ModelResiduals,
-    image_idxs: Sequence[int],
-    depth: FloatArray,
+    shapes: Sequence[CameraShape], source: ModelSums, image_idxs: Sequence[int], depth: FloatArray
 ) -> tuple[list[MisfitTests], list[PointSums]]:
     """What the inliers of images, with their cameras' shapes and depths, add up to; of small images together."""
     alike: dict[tuple[int, int], list[int]] = {}
     out: dict[int, tuple[MisfitTests, PointSums]] = {}
-    num_of = np.diff(residuals.offsets)
-    tested = misfit_of_images(model, residuals, [i for i in image_idxs if num_of[i] > MAX_JOINED])
+    model, residuals = source.model, source.residuals
+    tested = misfit_of_images(source, [i for i in image_idxs if source.num_of(i) > MAX_JOINED])
     for place, (shape, image_idx) in enumerate(zip(shapes, image_idxs, strict=True)):
         rows = residuals.rows(image_idx)
         num_inliers = rows.stop - rows.start

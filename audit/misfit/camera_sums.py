@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.misfit import NUM_FEATURES, Tracks
 from sfm_audit.audit.misfit.features import FEATURE_OF_FIELD, FIELD_OF_FEATURE, widened, widened_columns
@@ -22,7 +21,6 @@ from sfm_audit.audit.misfit.stacked import LOST_DIGITS, LOST_OF_SMOOTH, profiled
 from sfm_audit.audit.misfit.sums import ModelSums
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
 
 _POSE: Final = 6
 _SMOOTH: Final = GROUP_COLUMNS[MisfitGroup.SMOOTH]
@@ -31,7 +29,7 @@ _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns
 _TRACKS_AT_ONCE: Final = 1 << 16  # whose scores are in memory at the same time; numpy has all
 
 
-def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: Sequence[int]) -> PooledTests | None:
+def camera_tests_of_sums(source: ModelSums, images: Sequence[int]) -> PooledTests | None:
     """Test a camera on its images; None where `camera_tests` has to say.
 
     Parameters
@@ -42,7 +40,6 @@ def camera_tests_of_sums(model: SparseModel, residuals: ModelResiduals, images: 
     -----
     Two passes over the observations. Memory: 3 kB for each image and 320 bytes for each of 65,536 tracks.
     """
-    source = ModelSums(model, residuals)
     num_observations = sum(source.num_of(image) for image in images)
     if not images or not all(map(source.can_sum, images)) or num_observations < _MIN_OBSERVATIONS * len(images):
         return None

@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.misfit.features import widened, widened_columns
 from sfm_audit.audit.misfit.mixed import smooth_tests
 from sfm_audit.audit.misfit.outcome import MisfitTests
@@ -19,7 +18,6 @@ from sfm_audit.audit.misfit.stacked import Sizes, profiled, tests_of_stack
 from sfm_audit.audit.misfit.sums import ModelSums, WindowSums
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray
-from sfm_audit.loaders.model import SparseModel
 
 _ALL: Final = frozenset(GROUPS)
 _NOT_SMOOTH: Final = _ALL - {MisfitGroup.SMOOTH}
@@ -32,14 +30,13 @@ class TestedImage(NamedTuple):
     gram: FloatArray
 
 
-def misfit_of_images(model: SparseModel, residuals: ModelResiduals, images: Sequence[int]) -> dict[int, TestedImage]:
+def misfit_of_images(source: ModelSums, images: Sequence[int]) -> dict[int, TestedImage]:
     """Return the score tests of images, by row of the image table; without those that `prepare` has to answer for.
 
     Parameters
     ----------
     images : rows; their cameras exist
     """
-    source = ModelSums(model, residuals)
     out: dict[int, TestedImage] = {}
     with np.errstate(all="ignore"):  # what is out of range is in doubt
         for window in source.windows([image for image in images if source.can_sum(image)]):

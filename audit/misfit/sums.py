@@ -39,11 +39,12 @@ from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
 from sfm_audit.audit.misfit.pooled import add_rows
 from sfm_audit.audit.misfit.score import Clusters
 from sfm_audit.audit.table.words import MisfitGroup
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord, SparseModel, rotation_from_quat
 
 _MAX_IMAGES: Final = 64
+_FEW_OF_POINTS: Final = 8  # observations of fewer than this share of the model's points are sorted
 _MAX_OBSERVATIONS: Final = 1 << 17
 _FEW_OBSERVATIONS: Final = 1 << 14  # whose features are in memory at the same time
 
@@ -51,21 +52,24 @@ _FEW_OBSERVATIONS: Final = 1 << 14  # whose features are in memory at the same t
 class ModelSums:
     """Sums over the observations of images of one model, compiled where there are kernels.
 
+    Make one for all questions about a model: its arrays are checked once.
+
     Parameters
     ----------
     model, residuals : the model and its inliers
     """
 
     def __init__(self, model: SparseModel, residuals: ModelResiduals) -> None:
-        self._model, self._residuals = model, residuals
+        self.model, self.residuals = model, residuals
+        self._numbered: IntArray = np.empty(0, dtype=np.int64)
 
     @cached_property
     def observed(self) -> Observed:
         """What kernels take of the model."""
-        residuals = self._residuals
+        residuals = self.residuals
         return Observed.of(
-            self._model.points.xyz_world,
-            self._model.observations.xy_px,
+            self.model.points.xyz_world,
+            self.model.observations.xy_px,
             (residuals.point_idx, residuals.observation_row),
             residuals.residuals_px,
             residuals.point_jacobian,
@@ -73,32 +77,50 @@ class ModelSums:
 
     def camera(self, image: int) -> CameraRecord:
         """Of the image in this row, which has inliers."""
-        return self._model.camera(int(self._model.images.camera_idx[image]))
+        return self.model.camera(int(self.model.images.camera_idx[image]))
 
     def num_of(self, image: int) -> int:
         """Inliers of the image in this row."""
-        rows = self._residuals.rows(image)
+        rows = self.residuals.rows(image)
         return int(rows.stop - rows.start)
 
     def inliers(self, image: int) -> ImageInliers:
         """Inliers of the image in this row."""
-        return image_inliers(self._model, self._residuals, image)
+        return image_inliers(self.model, self.residuals, image)
 
     def keypoints(self, image: int) -> FloatArray:
         """(n, 2) observed, of the image in this row."""
-        row = self._residuals.observation_row[self._residuals.rows(image)]
-        return self._model.observations.xy_px.take(row, axis=0)
+        row = self.residuals.observation_row[self.residuals.rows(image)]
+        return self.model.observations.xy_px.take(row, axis=0)
 
     def points(self, image: int) -> IntArray:
         """(n,) rows of the points that the image in this row sees."""
-        return self._residuals.point_idx[self._residuals.rows(image)]
+        return self.residuals.point_idx[self.residuals.rows(image)]
+
+    def points_of(self, images: Sequence[int]) -> IntArray:
+        """Return the points that these images see, ascending rows of the point table."""
+        seen_by = [self.points(image) for image in images]
+        if _FEW_OF_POINTS * sum(map(len, seen_by)) < len(self.model.points):
+            return distinct(np.concatenate(seen_by)).astype(np.int64)
+        seen = np.zeros(len(self.model.points), dtype=np.bool_)
+        for points in seen_by:
+            seen[points] = True
+        return np.flatnonzero(seen).astype(np.int64)
 
     def tracks(self, images: Sequence[int]) -> tuple[IntArray, int]:
-        """Return the number of each point (P,) among those that these images see, -1 for others; how many they are."""
-        seen = np.zeros(len(self._model.points), dtype=np.bool_)
-        for image in images:
-            seen[self.points(image)] = True
-        return np.where(seen, np.cumsum(seen) - 1, -1).astype(np.int64), int(np.count_nonzero(seen))
+        """Return the number of each point (P,) among those that these images see, -1 for others; how many they are.
+
+        The array is used again when it is asked for again: cameras are many, and their points few.
+        """
+        points = self.points_of(images)
+        self._track_of_point[self._numbered] = -1
+        self._track_of_point[points] = np.arange(len(points))
+        self._numbered = points
+        return self._track_of_point, len(points)
+
+    @cached_property
+    def _track_of_point(self) -> IntArray:
+        return np.full(len(self.model.points), -1, dtype=np.int64)
 
     def can_sum(self, image: int) -> bool:
         """Whether the image in this row has fields, and room for its columns."""
@@ -132,7 +154,7 @@ class ModelSums:
 
     def window(self, images: Sequence[int], cameras: Sequence[CameraRecord]) -> Window:
         """Return what kernels take of images of one camera model."""
-        offsets, table = self._residuals.offsets, self._model.images
+        offsets, table = self.residuals.offsets, self.model.images
         chosen = np.array(images, dtype=np.int64)
         quats = table.quat_cam_from_world_wxyz[chosen]
         numbers = np.empty((len(images), 22))
@@ -140,7 +162,7 @@ class ModelSums:
         numbers[:, 7:16] = np.linalg.pinv(rotation_from_quat(quats).swapaxes(1, 2)).reshape(-1, 9)
         numbers[:, 16:] = [_lens_numbers(camera) for camera in cameras]
         rows = np.stack([offsets[chosen], offsets[chosen + 1]], axis=1).astype(np.int64)
-        extra = tuple(self._residuals.d_extra[image] for image in images)
+        extra = tuple(self.residuals.d_extra[image] for image in images)
         return Window(np.ascontiguousarray(rows), numbers, _facts(cameras[0].model), extra)
 
 

@@ -79,9 +79,9 @@ def test_tests_from_sums_are_those_of_one_image_alone(tmp_path, name, path):
     model, residuals = model_of(tmp_path, name, twins=20, seed=2)
     if path == "numpy":
         with numpy_only():
-            found = misfit_of_images(model, residuals, range(len(NUMBERS)))
+            found = misfit_of_images(ModelSums(model, residuals), range(len(NUMBERS)))
     else:
-        found = misfit_of_images(model, residuals, range(len(NUMBERS)))
+        found = misfit_of_images(ModelSums(model, residuals), range(len(NUMBERS)))
     assert 0 in found or name not in SURE
     for image, own in found.items():
         nuisance, expected = alone(model, residuals, image)
@@ -122,8 +122,8 @@ def test_the_unit_of_the_world_does_not_matter(tmp_path, scale):
     )
     points = dataclasses.replace(model.points, xyz_world=scale * model.points.xyz_world)
     other = dataclasses.replace(model, images=images, points=points)
-    found = misfit_of_images(other, model_residuals(other), [0, 1])
-    expected = misfit_of_images(model, residuals, [0, 1])
+    found = misfit_of_images(ModelSums(other, model_residuals(other)), [0, 1])
+    expected = misfit_of_images(ModelSums(model, residuals), [0, 1])
     assert sorted(found) == [0, 1]
     for image, own in found.items():
         assert_same(own.tests, expected[image].tests)
@@ -137,9 +137,9 @@ def test_smooth_fields_that_nearly_are_absorbed_keep_their_digits(tmp_path, monk
     monkeypatch.setattr(images_module, "smooth_tests", lambda *a: asked.append(a[1]) or mixed.smooth_tests(*a))
     if path == "numpy":
         with numpy_only():
-            found = misfit_of_images(model, residuals, [0, 1, 2])
+            found = misfit_of_images(ModelSums(model, residuals), [0, 1, 2])
     else:
-        found = misfit_of_images(model, residuals, [0, 1, 2])
+        found = misfit_of_images(ModelSums(model, residuals), [0, 1, 2])
     assert sorted(found) == [0, 1, 2]
     assert bool(asked) == (k1 > 0)
     for image, own in found.items():
@@ -173,18 +173,18 @@ def test_ranks_near_the_threshold_stay_in_doubt():
 def test_images_in_doubt_are_left_out(tmp_path):
     """The numerator and the denominator of FULL_OPENCV can hardly be told apart where both are small."""
     model, residuals = model_of(tmp_path, "FULL_OPENCV", (200, 150))
-    assert not misfit_of_images(model, residuals, [0, 1])
+    assert not misfit_of_images(ModelSums(model, residuals), [0, 1])
 
 
 def test_panoramas_and_empty_images_have_no_sums(tmp_path):
     model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (100, 0))
-    assert list(misfit_of_images(model, residuals, [0, 1])) == [0]
-    assert not misfit_of_images(model, residuals, [])
+    assert list(misfit_of_images(ModelSums(model, residuals), [0, 1])) == [0]
+    assert not misfit_of_images(ModelSums(model, residuals), [])
 
 
 def test_few_points_are_not_enough_evidence(tmp_path):
     model, residuals = model_of(tmp_path, "SIMPLE_RADIAL", (300, *range(1, 30, 3)))
-    found = misfit_of_images(model, residuals, range(len(model.images)))
+    found = misfit_of_images(ModelSums(model, residuals), range(len(model.images)))
     assert max(found) > 5
     for image, own in found.items():
         assert_same(own.tests, alone(model, residuals, image)[1])
@@ -198,9 +198,9 @@ def test_numbers_out_of_range_are_left_to_numpy(tmp_path, value):
         array = getattr(residuals, field).copy()
         array[0, ..., 3] = value
         odd = dataclasses.replace(residuals, **{field: array})
-        found = misfit_of_images(model, odd, [0, 1])
+        found = misfit_of_images(ModelSums(model, odd), [0, 1])
         with numpy_only():
-            assert sorted(misfit_of_images(model, odd, [0, 1])) == sorted(found)
+            assert sorted(misfit_of_images(ModelSums(model, odd), [0, 1])) == sorted(found)
         assert 1 in found
         if not math.isfinite(value):
             assert 0 not in found

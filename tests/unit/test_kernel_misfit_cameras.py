@@ -35,9 +35,9 @@ def test_a_shared_camera_is_tested_from_sums_as_from_its_columns(tmp_path, monke
     images = [0, 1, 3]
     if path == "numpy":
         with numpy_only():
-            found = camera_tests_of_sums(model, residuals, images)
+            found = camera_tests_of_sums(ModelSums(model, residuals), images)
     else:
-        found = camera_tests_of_sums(model, residuals, images)
+        found = camera_tests_of_sums(ModelSums(model, residuals), images)
     expected = old_tests(model, residuals, images)
     assert found is not None
     for counts in (found, expected):
@@ -55,9 +55,9 @@ def test_smooth_fields_that_a_shared_camera_nearly_has_keep_their_digits(tmp_pat
     monkeypatch.setattr(camera_sums, "mix_of", lambda *a: asked.append(1) or mixed.mix_of(*a))
     if path == "numpy":
         with numpy_only():
-            found = camera_tests_of_sums(model, residuals, [0, 1, 2])
+            found = camera_tests_of_sums(ModelSums(model, residuals), [0, 1, 2])
     else:
-        found = camera_tests_of_sums(model, residuals, [0, 1, 2])
+        found = camera_tests_of_sums(ModelSums(model, residuals), [0, 1, 2])
     assert found is not None
     assert asked == [1]
     assert_same(found.tests, old_tests(model, residuals, [0, 1, 2]).tests)
@@ -65,13 +65,13 @@ def test_smooth_fields_that_a_shared_camera_nearly_has_keep_their_digits(tmp_pat
 
 def test_shared_cameras_in_doubt_are_left_out(tmp_path):
     model, residuals = model_of(tmp_path / "few", "SIMPLE_RADIAL", (300, 2, 200), shared=True)
-    assert camera_tests_of_sums(model, residuals, [0, 1, 2]) is None
-    assert camera_tests_of_sums(model, residuals, [0, 2]) is not None
-    assert camera_tests_of_sums(model, residuals, []) is None
+    assert camera_tests_of_sums(ModelSums(model, residuals), [0, 1, 2]) is None
+    assert camera_tests_of_sums(ModelSums(model, residuals), [0, 2]) is not None
+    assert camera_tests_of_sums(ModelSums(model, residuals), []) is None
     model, residuals = model_of(tmp_path / "small", "SIMPLE_RADIAL", (60, 60), shared=True)
-    assert camera_tests_of_sums(model, residuals, [0, 1]) is None
+    assert camera_tests_of_sums(ModelSums(model, residuals), [0, 1]) is None
     model, residuals = model_of(tmp_path / "singular", "FULL_OPENCV", (300, 200), shared=True)
-    assert camera_tests_of_sums(model, residuals, [0, 1]) is None
+    assert camera_tests_of_sums(ModelSums(model, residuals), [0, 1]) is None
 
 
 @compiled
@@ -87,6 +87,10 @@ def test_the_kernel_adds_to_no_track_that_is_not_asked_for(tmp_path):
     part = np.zeros((20, NUM_FEATURES))
     assert misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 50), part)
     assert (part == everything[30:50]).all()
+    few, num_few = source.tracks([1])  # the same array again
+    assert num_few == 80
+    assert sorted(few[few >= 0].tolist()) == list(range(80))
+    of_point, num_tracks = source.tracks([0, 1])
     assert (part != 0).any(axis=1).all()
     with pytest.raises(ValueError, match="per_track"):
         misfit_tracks(source.observed, window, profile, Tracks(of_point, 30, 51), part)
