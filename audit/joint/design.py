@@ -13,7 +13,7 @@ from sfm_audit.audit.joint.layout import NUM_POSE, Layout
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.joint_parts import DesignInputs, fill_design
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 AT_ONCE: Final = 2**15
 """Observations of an image up to which its derivatives are kept, and all its fields in memory at the same time."""
@@ -87,18 +87,28 @@ def make_design(
     ends = np.cumsum(np.where(is_kept, counts, 0))
     first = np.where(is_kept, ends - counts, -1).astype(np.int64)
     kept = np.zeros((int(ends[-1]) if ends.size else 0, 2, layout.width))
-    for image in np.flatnonzero(is_kept & (counts > 0)).tolist():
+    images = np.flatnonzero(is_kept & (counts > 0))
+    inverses = np.linalg.pinv(rotation_from_quat(model.images.quat_cam_from_world_wxyz[images]))  # all at once
+    for image, inverse in zip(images.tolist(), inverses, strict=True):
         own = source[int(offsets[image]) : int(offsets[image + 1])]
-        _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, (image, own))
+        _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, (image, own), inverse)
     return Design(model, residuals, layout, source, offsets, kept, first)
 
 
 def _fill(
-    own: FloatArray, model: SparseModel, residuals: ModelResiduals, layout: Layout, which: tuple[int, IntArray]
+    own: FloatArray,
+    model: SparseModel,
+    residuals: ModelResiduals,
+    layout: Layout,
+    which: tuple[int, IntArray],
+    world_from_cam: FloatArray | None = None,
 ) -> None:
-    """Write the rows of an image's chosen observations, columns of ModelResiduals."""
+    """Write the rows of an image's chosen observations, columns of ModelResiduals.
+
+    ``world_from_cam`` (3, 3): the inverse of the image's rotation, where it is at hand.
+    """
     image, source = which
-    inputs = _inputs(model, residuals, layout, image, source)
+    inputs = _inputs(model, residuals, layout, which, world_from_cam)
     if inputs is not None and fill_design(own, inputs):
         return
     projected = image_inliers(model, residuals, image, source - residuals.offsets[image]).projected
@@ -112,9 +122,14 @@ def _fill(
 
 
 def _inputs(
-    model: SparseModel, residuals: ModelResiduals, layout: Layout, image_idx: int, source: IntArray
+    model: SparseModel,
+    residuals: ModelResiduals,
+    layout: Layout,
+    which: tuple[int, IntArray],
+    world_from_cam: FloatArray | None,
 ) -> DesignInputs | None:
     """What the compiled design is made of; None for numpy: panoramas have columns that are not finite."""
+    image_idx, source = which
     image = model.image(image_idx)
     camera = image.camera
     if not kernels_in_use() or camera is None or camera.model.is_spherical:
@@ -125,7 +140,8 @@ def _inputs(
     kinds |= {param: 3 + e for e, param in enumerate(extras)}
     params = layout.own_param_idxs[int(layout.camera_idx[image_idx])]
     lens = camera.params[[focals[0], focals[-1], centre[0], centre[-1]]]
-    facts = [rotation.ravel(), np.linalg.pinv(rotation).ravel(), image.translation_cam_from_world, lens]
+    inverse = np.linalg.pinv(rotation) if world_from_cam is None else world_from_cam
+    facts = [rotation.ravel(), inverse.ravel(), image.translation_cam_from_world, lens]
     observed = model.observations.xy_px.take(residuals.observation_row[source], axis=0)
     return DesignInputs(
         np.concatenate(facts),

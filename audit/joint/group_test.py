@@ -1,8 +1,12 @@
-"""Is a group of candidate fields in what the base leaves, and how large is it? (method.md (8))."""
+"""Is a group of candidate fields in what the base leaves, and how large is it? (method.md (8)).
+
+Images are judged in stacks: the matrices are small, and a call for each would cost more than their arithmetic.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -10,7 +14,7 @@ from scipy import special
 
 from sfm_audit.audit.joint.candidates import CandidateScores
 from sfm_audit.audit.table.words import MisfitStatus
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray
 
 KEPT_EIGENVALUE: Final = 1e-4  # of K with unit columns: below it, base and points absorb the direction
 MIN_OBSERVATIONS_PER_RANK: Final = 4
@@ -35,14 +39,8 @@ def untested(status: MisfitStatus, rank: int | None = None) -> GroupTest:
 
 def group_root(scores: CandidateScores, own: slice) -> FloatArray:
     """Return L (r, c) with L K L^T = 1, over eigenvalues above 1e-4 of the columns scaled by |E|."""
-    length = np.sqrt(scores.sq_length[own])
-    scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
-    gram = scores.gram[own, own] * scale * scale[:, None]
-    if not np.isfinite(gram).all():
-        return np.zeros((0, len(scale)))
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > KEPT_EIGENVALUE
-    return np.asarray((vectors[:, kept] / np.sqrt(values[kept])).T * scale)
+    roots, kept = _roots([scores], own)
+    return np.asarray(roots[0, kept[0]])
 
 
 def test_group(scores: CandidateScores, own: slice, root: FloatArray, *, sigma_px: float, rms_px: float) -> GroupTest:
@@ -52,40 +50,94 @@ def test_group(scores: CandidateScores, own: slice, root: FloatArray, *, sigma_p
     ----------
     root : L of `group_root`
     """
-    if not np.isfinite(scores.gram[own, own]).all():
-        return untested(MisfitStatus.NOT_FINITE)
-    rank, n = len(root), scores.num_observations
-    if rank == 0:
-        return untested(MisfitStatus.ABSORBED, 0)
-    clusters = min(scores.num_tracks, n)
-    if min(n, clusters) < MIN_OBSERVATIONS_PER_RANK * rank:
-        return untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank)
-    z = root @ scores.score[own]
-    spread = root @ scores.meat[own, own] @ root.T
-    statistic = _quadratic_form(z, spread)
-    if math.isnan(statistic):
-        return untested(MisfitStatus.SINGULAR, rank)
-    # (T / r)(c - r) / c / (1 - T / c) ~ F(r, c - r) is T / c ~ Beta: its upper tail loses no digits
-    left = max(1.0 - statistic / clusters, 0.0)
-    p = float(special.betainc(0.5 * (clusters - rank), 0.5 * rank, left))
-    gain = float(z @ z - np.trace(spread))
-    px = sigma_px * math.sqrt(max(0.0, gain) / n)
-    if px > MAX_EFFECT_OVER_RMS * rms_px:
-        return untested(MisfitStatus.NOT_ESTIMABLE, rank)
-    return GroupTest(p, px, gain, rank, MisfitStatus.TESTED)
+    kept = np.ones((1, len(root)), dtype=bool)
+    return _judged([scores], own, root[None], kept, np.array([sigma_px]), np.array([rms_px]))[0]
 
 
-def _quadratic_form(z: FloatArray, spread: FloatArray) -> float:
-    """z^T M^-1 z; NaN where M is singular."""
-    diagonal = spread.diagonal()
-    if not np.isfinite(spread).all() or not (diagonal > 0).all():
-        return math.nan
-    scale = np.sqrt(diagonal)
+def test_groups(
+    scores: Sequence[CandidateScores], own: slice, sigma_px: FloatArray, rms_px: FloatArray
+) -> list[GroupTest]:
+    """Test one group of the candidate fields of some images, each by itself.
+
+    Parameters
+    ----------
+    scores : of each image, with the same fields        sigma_px, rms_px : of each image
+    """
+    return _judged(scores, own, *_roots(scores, own), sigma_px, rms_px) if scores else []
+
+
+def _roots(scores: Sequence[CandidateScores], own: slice) -> tuple[FloatArray, BoolArray]:
+    """(B, c, c) L of each image, and (B, c) which rows of it are directions that are kept; the others are zero."""
+    length = np.sqrt(np.stack([each.sq_length[own] for each in scores]))
+    scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
+    gram = np.stack([each.gram[own, own] for each in scores]) * scale[:, None, :] * scale[:, :, None]
+    finite = np.isfinite(gram).all(axis=(1, 2))
+    gram[~finite] = 0.0
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > KEPT_EIGENVALUE
+    by_row = (vectors / np.sqrt(np.where(kept, values, 1.0))[:, None, :]).swapaxes(1, 2)
+    return np.where(kept[:, :, None], by_row * scale[:, None, :], 0.0), kept
+
+
+def _judged(
+    scores: Sequence[CandidateScores],
+    own: slice,
+    roots: FloatArray,
+    kept: BoolArray,
+    sigma_px: FloatArray,
+    rms_px: FloatArray,
+) -> list[GroupTest]:
+    finite = [bool(np.isfinite(each.gram[own, own]).all()) for each in scores]
+    n = np.array([each.num_observations for each in scores])
+    clusters, ranks = np.minimum([each.num_tracks for each in scores], n), kept.sum(axis=1)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is not tested
+        z = np.einsum("brc,bc->br", roots, np.stack([each.score[own] for each in scores]))
+        spread = roots @ np.stack([each.meat[own, own] for each in scores]) @ roots.swapaxes(1, 2)
+        statistic = _quadratic_forms(z, spread, kept)
+        # (T / r)(c - r) / c / (1 - T / c) ~ F(r, c - r) is T / c ~ Beta: its upper tail loses no digits
+        left = np.maximum(1.0 - statistic / clusters, 0.0)
+        p = special.betainc(0.5 * (clusters - ranks), 0.5 * ranks, left)
+        gain = (z * z).sum(axis=1) - np.einsum("brr->b", spread)
+        px = sigma_px * np.sqrt(np.maximum(0.0, gain) / n)
+    out = []
+    for k, rank in enumerate(ranks.tolist()):
+        if not finite[k]:
+            out.append(untested(MisfitStatus.NOT_FINITE))
+        elif rank == 0:
+            out.append(untested(MisfitStatus.ABSORBED, 0))
+        elif clusters[k] < MIN_OBSERVATIONS_PER_RANK * rank:
+            out.append(untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank))
+        elif math.isnan(statistic[k]):
+            out.append(untested(MisfitStatus.SINGULAR, rank))
+        elif px[k] > MAX_EFFECT_OVER_RMS * rms_px[k]:
+            out.append(untested(MisfitStatus.NOT_ESTIMABLE, rank))
+        else:
+            out.append(GroupTest(float(p[k]), float(px[k]), float(gain[k]), rank, MisfitStatus.TESTED))
+    return out
+
+
+def _quadratic_forms(z: FloatArray, spread: FloatArray, kept: BoolArray) -> FloatArray:
+    """z^T M^-1 z (B,) over the rows and columns that are kept; NaN where M is singular."""
+    diagonal = np.einsum("brr->br", spread)
+    regular = np.isfinite(spread).all(axis=(1, 2)) & (~kept | (diagonal > 0)).all(axis=1)
+    used = kept & regular[:, None]
+    scale = np.sqrt(np.where(used, diagonal, 1.0))
+    scaled = np.where(used[:, :, None] & used[:, None, :], spread / scale[:, :, None] / scale[:, None, :], 0.0)
+    np.einsum("brr->br", scaled)[~used] = 1.0
+    factor = _cholesky(scaled)
+    smallest = np.where(used, np.einsum("brr->br", factor), 1.0).min(axis=1, initial=1.0)
+    sure = regular & (smallest**2 > _SINGULAR_MEAT)
+    out = np.full(len(z), math.nan)
+    whitened = np.linalg.solve(factor[sure], (z / scale)[sure, :, None])[:, :, 0]
+    out[sure] = (np.where(used[sure], whitened, 0.0) ** 2).sum(axis=1)
+    return out
+
+
+def _cholesky(matrices: FloatArray) -> FloatArray:
+    """Lower Cholesky factors of (B, r, r); zero where there is none."""
     try:
-        factor = np.linalg.cholesky(spread / scale / scale[:, None])
+        return np.asarray(np.linalg.cholesky(matrices))
     except np.linalg.LinAlgError:
-        return math.nan
-    if factor.diagonal().min() ** 2 <= _SINGULAR_MEAT:
-        return math.nan
-    whitened = np.linalg.solve(factor, z / scale)
-    return float(whitened @ whitened)
+        if len(matrices) == 1:
+            return np.zeros_like(matrices)
+        return np.concatenate([_cholesky(each[None]) for each in matrices])

@@ -13,13 +13,14 @@ import numpy as np
 
 from sfm_audit.audit.cameras.projection import is_fisheye
 from sfm_audit.audit.joint.candidates import CandidateScores
+from sfm_audit.audit.joint.design import POINT
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.joint.system import Base, JointSystem
 from sfm_audit.audit.kernels.joint import FIELDS, SCALAR, FirstHalf, JointSums
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
-from sfm_audit.loaders.model import CameraRecord
+from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 _X, _Y, _BOTH = 0, SCALAR, 2 * SCALAR  # where functions along x, along y and with both components begin
 _ROLLING, _NEXT = _BOTH + 4, _BOTH + 10
@@ -61,7 +62,7 @@ def image_scores(
     right = placed.collected(half.right)
     solution = base.inverse.within(placed.support, right)
     sums.second(half, tracks, placed.spread(solution))
-    made_of = _fields(camera, np.asarray(np.linalg.pinv(image.rotation_cam_from_world), dtype=np.float64), power)
+    made_of = _fields(camera, _world_from_cam(base, image, image_idx), power)
     gram = half.gram - right.T @ solution
     with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
         meat = half.track_score.T @ half.track_score
@@ -84,6 +85,14 @@ def _inputs(system: JointSystem, image_idx: int, camera: CameraRecord) -> tuple[
     xyz_world = system.model.points.xyz_world.take(residuals.point_idx[source], axis=0)
     observed = system.model.observations.xy_px.take(residuals.observation_row[source], axis=0)
     return facts, xyz_world, observed - residuals.residuals_px.take(source, axis=1).T
+
+
+def _world_from_cam(base: Base, image: ImageRecord, image_idx: int) -> FloatArray:
+    """(3, 3) inverse of an image's rotation."""
+    observations = base.observations
+    if not observations.layout.has_rigs:
+        return np.asarray(observations.transform[image_idx][POINT, POINT])
+    return np.asarray(np.linalg.pinv(image.rotation_cam_from_world))
 
 
 def _fields(camera: CameraRecord, world_from_cam: FloatArray, power: int) -> FloatArray:

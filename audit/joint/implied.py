@@ -245,10 +245,26 @@ def _alone(scores: CandidateScores, own: slice) -> tuple[FloatArray, FloatArray,
     """Step K^+ u, its sd K^+ (sum G G^T) K^+, and the gain; NaN where base and points absorb a direction."""
     scale = 1.0 / np.sqrt(scores.sq_length[own])
     gram = scores.gram[own, own] * scale * scale[:, None]
-    if not np.isfinite(gram).all() or np.linalg.eigvalsh(gram)[0] <= _ABSORBED:
+    if not np.isfinite(gram).all() or _smallest_eigenvalue(gram) <= _ABSORBED:
         unknown = np.full(len(scale), np.nan)
         return unknown, unknown, math.nan
-    inverse = np.linalg.inv(gram) * scale * scale[:, None]
+    inverse = _inverse(gram) * scale * scale[:, None]
     step = inverse @ scores.score[own]
-    variance = np.einsum("ai,ab,bi->i", inverse, scores.meat[own, own], inverse)
+    variance = ((inverse @ scores.meat[own, own]) * inverse).sum(axis=1)
     return step, np.sqrt(np.maximum(variance, 0.0)), float(step @ scores.score[own])
+
+
+def _smallest_eigenvalue(gram: FloatArray) -> float:
+    """Of a symmetric matrix (k, k), k = 1 or 2."""
+    if len(gram) == 1:
+        return float(gram[0, 0])
+    (a, b), (_, d) = gram.tolist()
+    return float(0.5 * (a + d) - math.hypot(0.5 * (a - d), b))
+
+
+def _inverse(gram: FloatArray) -> FloatArray:
+    """Of a symmetric matrix (k, k), k = 1 or 2."""
+    if len(gram) == 1:
+        return np.asarray(1.0 / gram)
+    (a, b), (_, d) = gram.tolist()
+    return np.asarray(np.array([[d, -b], [-b, a]]) / (a * d - b * b))

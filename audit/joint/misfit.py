@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple, Protocol
@@ -12,11 +13,12 @@ import numpy as np
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
-from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_group, untested
+from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_groups, untested
 from sfm_audit.audit.joint.image_scores import image_scores, sums_of_base
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
+from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
@@ -166,9 +168,16 @@ class _Rounds:
         return self._result(bool(2 * np.count_nonzero(self._effects() > self._tau_px) > num_tested))
 
     def _test(self, chosen: BoolArray) -> None:
-        for image in np.flatnonzero(chosen).tolist():
-            scores = self._scores(image)
-            self.tests[image], self._worth[image] = _image_tests(self._system, image, scores, self._alpha)
+        images = np.flatnonzero(chosen).tolist()
+        counts = np.array([self._system.observations.num_of(image) for image in images], dtype=np.int64)
+
+        def tested(start: int, stop: int) -> None:
+            some = images[start:stop]
+            answers = _image_tests(self._system, some, [self._scores(image) for image in some], self._alpha)
+            for image, answer in zip(some, answers, strict=True):
+                self.tests[image], self._worth[image] = answer
+
+        over_ranges(tested, len(images), counts)
         waiting = np.flatnonzero(self._tested & (self._round < 0))
         p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()])
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
@@ -274,17 +283,22 @@ def _fields_of(
 
 
 def _image_tests(
-    system: JointSystem, image: int, scores: CandidateScores | None, alpha: float
-) -> tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]:
-    """Tests of all groups, and the worth of those that may be significant."""
-    if scores is None:
-        return dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS)), {}
+    system: JointSystem, images: Sequence[int], scores: Sequence[CandidateScores | None], alpha: float
+) -> list[tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]]:
+    """Of each image the tests of all groups, and the worth of those that may be significant."""
     observations = system.observations
-    sigma_px, rms_px = float(observations.sigma_px[image]), float(observations.rms_px[image])
-    tests, worth = {}, {}
-    for group, own in GROUP_COLUMNS.items():
-        root = group_root(scores, own)
-        tests[group] = test_group(scores, own, root, sigma_px=sigma_px, rms_px=rms_px)
-        if tests[group].p < alpha:
-            worth[group] = worth_of(system, image, scores, own, root)
-    return tests, worth
+    known = [each for each in scores if each is not None]
+    asked = [image for image, each in zip(images, scores, strict=True) if each is not None]
+    sigma_px, rms_px = observations.sigma_px[asked], observations.rms_px[asked]
+    by_group = {group: test_groups(known, own, sigma_px, rms_px) for group, own in GROUP_COLUMNS.items()}
+    found: dict[int, tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]] = {}
+    for k, image in enumerate(asked):
+        tests = {group: answers[k] for group, answers in by_group.items()}
+        worth = {
+            group: worth_of(system, image, known[k], own, group_root(known[k], own))
+            for group, own in GROUP_COLUMNS.items()
+            if tests[group].p < alpha
+        }
+        found[image] = tests, worth
+    nothing = dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS))
+    return [found.get(image, (nothing, {})) for image in images]

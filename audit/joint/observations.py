@@ -146,8 +146,7 @@ def joint_observations(
     offsets = np.searchsorted(image_idx, np.arange(len(counts) + 1)).astype(np.int64)
     point_idx = np.arange(source.size) if points_independent else residuals.point_idx[source]
     num_points = source.size if points_independent else len(model.points)
-    by_point = np.argsort(point_idx, kind="stable").astype(np.int64)
-    point_offsets = np.concatenate([[0], np.cumsum(np.bincount(point_idx, minlength=num_points))]).astype(np.int64)
+    by_point, point_offsets = _by_point(point_idx, num_points)
     return JointObservations(
         model,
         residuals,
@@ -165,6 +164,15 @@ def joint_observations(
         point_offsets,
         points_independent,
     )
+
+
+def _by_point(point_idx: IntArray, num_points: int) -> tuple[IntArray, IntArray]:
+    """(n,) rows by point, then in order, and (P + 1,) where each point begins."""
+    compiled = kernels.rows_by_point(point_idx, num_points)
+    if compiled is not None:
+        return compiled
+    ends = np.cumsum(np.bincount(point_idx, minlength=num_points))
+    return np.argsort(point_idx, kind="stable").astype(np.int64), np.concatenate([[0], ends]).astype(np.int64)
 
 
 def _transforms(model: SparseModel, layout: Layout) -> FloatArray:

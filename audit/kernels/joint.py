@@ -94,7 +94,7 @@ class JointArrays:
 
 
 class JointSums:
-    """Sums over the views of a joint system; not for several threads at once (one object for each)."""
+    """Sums over the views of a joint system; several threads may ask at once."""
 
     def __init__(self, arrays: JointArrays) -> None:
         num_images, num_rows = len(arrays.offsets) - 1, len(arrays.image_idx)
@@ -130,7 +130,7 @@ class JointSums:
         self.width = int(arrays.design.shape[2])
         self._model = _Model(num_images, self.width, *(held[name].ctypes.data for name in _ARRAYS))
         self._model.held = held  # whoever keeps the addresses keeps the arrays
-        self._place = np.zeros(num_images, dtype=np.int64)
+        self._num_images = num_images
         views = np.diff(held["point_offsets"])[held["point_idx"]]
         self._is_first = _first_views(held)
         self._num_views = np.diff(np.concatenate([[0], np.cumsum(views)])[held["offsets"]])
@@ -207,7 +207,7 @@ class JointSums:
         track, num_tracks = tracks
         if function is None or scalar.shape != (n, SCALAR) or dense.shape != (n, 2, DENSE) or track.shape != (n,):
             return None
-        most = min(views, len(self._place))
+        most = min(views, self._num_images)
         view, own = np.empty((2, views), dtype=np.int32)
         around, start, num = (np.empty(size, dtype=np.int64) for size in (most, most + 1, 2))
         max_rows, max_scores = most * self.width, views * self.width
@@ -219,7 +219,20 @@ class JointSums:
         scores = np.empty(max_scores)
         status = function(
             ctypes.byref(self._model),
-            *(self._place, image_idx, scalar, dense, track, num_tracks, max_rows, view, own, around, start, num),
+            *(
+                np.zeros(self._num_images, dtype=np.int64),
+                image_idx,
+                scalar,
+                dense,
+                track,
+                num_tracks,
+                max_rows,
+                view,
+                own,
+                around,
+                start,
+                num,
+            ),
             *(absorbing, right, gram, plain, dense_plain, score, track_score, scores, max_scores),
         )
         if status != DONE:
@@ -248,12 +261,22 @@ class JointSums:
         views = int(self._num_views[image_idx])
         if function is None or any(values.shape != self._held["left"].shape for values in cleaned):
             return None
-        most = min(views, len(self._place))
+        most = min(views, self._num_images)
         around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
         slab, other = np.empty((2, most, self.width, self.width))
         grams, rights = np.empty((2, self.width, self.width)), np.empty((2, self.width))
         status = function(
-            ctypes.byref(self._model), self._place, image_idx, views, *cleaned, around, num, slab, other, grams, rights
+            ctypes.byref(self._model),
+            np.zeros(self._num_images, dtype=np.int64),
+            image_idx,
+            views,
+            *cleaned,
+            around,
+            num,
+            slab,
+            other,
+            grams,
+            rights,
         )
         if status != DONE:
             return None
@@ -266,12 +289,20 @@ class JointSums:
         if function is None:
             return None
         views = int(self._num_views[image_idx])
-        most = min(views, len(self._place))
+        most = min(views, self._num_images)
         around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
         slab = np.empty((most, self.width, self.width))
         track, num_tracks = self.tracks(image_idx)
         status = function(
-            ctypes.byref(self._model), self._place, image_idx, views, track, num_tracks, around, num, slab
+            ctypes.byref(self._model),
+            np.zeros(self._num_images, dtype=np.int64),
+            image_idx,
+            views,
+            track,
+            num_tracks,
+            around,
+            num,
+            slab,
         )
         return (around[: int(num[0])], slab[: int(num[0])]) if status == DONE else None
 
@@ -298,7 +329,7 @@ class JointSums:
         if (
             function is None
             or left_px.shape != self._held["left"].shape
-            or moved.shape != (len(self._place), self.width)
+            or moved.shape != (self._num_images, self.width)
         ):
             raise ValueError("steps of other images, or no kernels")
         function(ctypes.byref(self._model), moved, left_px)
@@ -308,7 +339,7 @@ class JointSums:
         function = kernel("joint_along_design", _ModelPointer, Doubles, Doubles)
         if function is None or values_px.shape != self._held["left"].shape:
             raise ValueError("values of other observations, or no kernels")
-        out = np.empty((len(self._place), self.width))
+        out = np.empty((self._num_images, self.width))
         function(ctypes.byref(self._model), np.ascontiguousarray(values_px), out)
         return out
 

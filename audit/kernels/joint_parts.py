@@ -95,6 +95,16 @@ def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) ->
     return out
 
 
+def rows_by_point(point_idx: IntArray, num_points: int) -> tuple[IntArray, IntArray] | None:
+    """(n,) rows by point, then in order, and (P + 1,) where each point begins; None for the numpy path."""
+    function = kernel("joint_by_point", Size, Size, Ints, Ints, Ints)
+    if function is None or point_idx.dtype != np.int64:
+        return None
+    by_point, offsets = np.empty(point_idx.size, dtype=np.int64), np.empty(num_points + 1, dtype=np.int64)
+    status = function(point_idx.size, num_points, np.ascontiguousarray(point_idx), by_point, offsets)
+    return (by_point, offsets) if status == _DONE else None
+
+
 def near_entries(
     place: IntArray, width: int, near: FloatArray, starts: IntArray, columns: IntArray
 ) -> FloatArray | None:

@@ -57,8 +57,11 @@ class Rounds:
         monkeypatch.setattr(joint_room, "_image_tests", self._tests)
         monkeypatch.setattr(joint_room, "include", self._include)
 
-    def _tests(self, _system, image, scores, _alpha):
-        assert scores == "scores"
+    def _tests(self, _system, images, scores, _alpha):
+        assert scores == ["scores"] * len(images)
+        return [self._answer(image) for image in images]
+
+    def _answer(self, image):
         answer = self.answers[image]
         tests = answer[min(self.num_asked[image], len(answer) - 1)] if isinstance(answer, list) else answer
         self.num_asked[image] += 1

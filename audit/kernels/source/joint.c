@@ -130,50 +130,70 @@ static inline __attribute__((always_inline)) void crossed(
     }
 }
 
-/* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. */
+/* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. Scalars for one
+ * row after the other, dense fields for four rows at a time: as many sums as there are registers. */
 static inline __attribute__((always_inline)) void subtract_fields(
     const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
     double *out) {
     for (int64_t c = 0; c < count; c++) {
-        wide x0 = {0}, x1 = {0}, x2 = {0}, x3 = {0}, y0 = {0}, y1 = {0}, y2 = {0}, y3 = {0}, d0 = {0}, d1 = {0}, d2 = {0};
+        wide x0 = {0}, x1 = {0}, x2 = {0}, x3 = {0}, y0 = {0}, y1 = {0}, y2 = {0}, y3 = {0};
         for (int64_t k = 0; k < num; k++) {
-            const double *f = scalar + SCALAR * own[k], *d = dense + 2 * DENSE * own[k];
-            double alongx = through[2 * ROWS * k + c], alongy = through[2 * ROWS * k + ROWS + c];
-            wide ax = {alongx, alongx, alongx, alongx}, ay = {alongy, alongy, alongy, alongy};
+            const double *f = scalar + SCALAR * own[k], *t = through + 2 * ROWS * k + c;
+            wide ax = {t[0], t[0], t[0], t[0]}, ay = {t[ROWS], t[ROWS], t[ROWS], t[ROWS]};
             wide f0 = LOAD(f), f1 = LOAD(f + 4), f2 = LOAD(f + 8), f3 = LOAD(f + 12);
             x0 += ax * f0, x1 += ax * f1, x2 += ax * f2, x3 += ax * f3;
             y0 += ay * f0, y1 += ay * f1, y2 += ay * f2, y3 += ay * f3;
-            d0 += ax * LOAD(d) + ay * LOAD(d + DENSE);
-            d1 += ax * LOAD(d + 4) + ay * LOAD(d + DENSE + 4);
-            d2 += ax * LOAD(d + 8) + ay * LOAD(d + DENSE + 8);
         }
         double *o = out + FIELDS * c;
         STORE(o) -= x0, STORE(o + 4) -= x1, STORE(o + 8) -= x2, STORE(o + 12) -= x3;
         STORE(o + 16) -= y0, STORE(o + 20) -= y1, STORE(o + 24) -= y2, STORE(o + 28) -= y3;
-        STORE(o + 32) -= d0, STORE(o + 36) -= d1, STORE(o + 40) -= d2;
+    }
+    for (int64_t c = 0; c < count; c += 2) { /* through has zeros behind the last row */
+        wide d0 = {0}, d1 = {0}, d2 = {0}, e0 = {0}, e1 = {0}, e2 = {0};
+        for (int64_t k = 0; k < num; k++) {
+            const double *d = dense + 2 * DENSE * own[k], *t = through + 2 * ROWS * k + c;
+            wide ax = {t[0], t[0], t[0], t[0]}, ay = {t[ROWS], t[ROWS], t[ROWS], t[ROWS]};
+            wide bx = {t[1], t[1], t[1], t[1]}, by = {t[ROWS + 1], t[ROWS + 1], t[ROWS + 1], t[ROWS + 1]};
+            wide p0 = LOAD(d), p1 = LOAD(d + 4), p2 = LOAD(d + 8);
+            wide q0 = LOAD(d + DENSE), q1 = LOAD(d + DENSE + 4), q2 = LOAD(d + DENSE + 8);
+            d0 += ax * p0 + ay * q0, d1 += ax * p1 + ay * q1, d2 += ax * p2 + ay * q2;
+            e0 += bx * p0 + by * q0, e1 += bx * p1 + by * q1, e2 += bx * p2 + by * q2;
+        }
+        double *o = out + FIELDS * c + 2 * SCALAR;
+        STORE(o) -= d0, STORE(o + 4) -= d1, STORE(o + 8) -= d2;
+        if (c + 1 < count) STORE(o + FIELDS) -= e0, STORE(o + FIELDS + 4) -= e1, STORE(o + FIELDS + 8) -= e2;
     }
 }
 
-/* Sums of products of own fields with weights P (2, 2): half of E^T P E. */
+enum { DEGREE = 8, MOMENTS = 48 }; /* 45 monomials of degree 0 .. 8, padded */
+
+/* Where x^a y^b stands among the moments: by degree, then by the power of y, as among the scalars. */
+static inline int moment_of(int a, int b) { return (a + b) * (a + b + 1) / 2 + b; }
+
+/* Sums of products of own fields with weights P (2, 2): half of E^T P E. Scalars times scalars are moments of the point. */
 typedef struct {
-    double xx[SCALAR][SCALAR], xy[SCALAR][SCALAR], yy[SCALAR][SCALAR], plain[SCALAR][SCALAR];
-    double xd[SCALAR][DENSE], yd[SCALAR][DENSE], dd[DENSE][DENSE];
-    double dense_plain[DENSE][DENSE];
+    double xx[MOMENTS], xy[MOMENTS], yy[MOMENTS], plain[MOMENTS];
+    double xd[SCALAR][DENSE], yd[SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE][DENSE];
 } own_gram;
 
 static inline __attribute__((always_inline)) void add_gram(
     own_gram *g, const double *f, const double *d, double w, double pxx, double pxy, double pyy) {
-    double dx[DENSE], dy[DENSE];
+    double dx[DENSE], dy[DENSE], moment[MOMENTS] = {0.0};
+    for (int j = 0; j < SCALAR - 1; j++) moment[j] = f[j];
+    for (int degree = 5, k = 15; degree <= DEGREE; degree++, k++) {
+        for (int j = 0; j < degree; j++, k++) moment[k] = moment[k - degree] * f[1];
+        moment[k] = moment[k - degree - 1] * f[2];
+    }
+    for (int j = 0; j < MOMENTS; j++) {
+        g->xx[j] += pxx * moment[j], g->xy[j] += pxy * moment[j], g->yy[j] += pyy * moment[j], g->plain[j] += w * moment[j];
+    }
     for (int j = 0; j < DENSE; j++) {
         double x = d[j], y = d[DENSE + j];
         dx[j] = pxx * x + pxy * y, dy[j] = pxy * x + pyy * y;
     }
     for (int i = 0; i < SCALAR; i++) {
-        double xx = pxx * f[i], xy = pxy * f[i], yy = pyy * f[i], plain = w * f[i];
-        for (int j = i / LANES * LANES; j < SCALAR; j++) {
-            g->xx[i][j] += xx * f[j], g->xy[i][j] += xy * f[j], g->yy[i][j] += yy * f[j], g->plain[i][j] += plain * f[j];
-        }
-        for (int j = 0; j < DENSE; j++) g->xd[i][j] += f[i] * dx[j], g->yd[i][j] += f[i] * dy[j];
+        for (int j = 0; j < DENSE; j++) g->xd[i][j] += f[i] * dx[j];
+        for (int j = 0; j < DENSE; j++) g->yd[i][j] += f[i] * dy[j];
     }
     for (int i = 0; i < DENSE; i++) {
         double x = w * d[i], y = w * d[DENSE + i];
@@ -184,14 +204,22 @@ static inline __attribute__((always_inline)) void add_gram(
 
 /* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, and w E^T E of the scalars and of the dense fields. */
 static void spread_gram(const own_gram *g, double *gram, double *plain, double *dense_plain) {
-    for (int i = 0; i < SCALAR; i++) {
-        for (int j = 0; j < SCALAR; j++) {
-            int a = i < j ? i : j, b = i < j ? j : i;
-            gram[i * FIELDS + j] = g->xx[a][b];
-            gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->xy[a][b];
-            gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->yy[a][b];
-            plain[i * SCALAR + j] = g->plain[a][b];
+    int power_x[SCALAR], power_y[SCALAR];
+    for (int degree = 0, k = 0; degree <= 4; degree++) {
+        for (int j = 0; j <= degree; j++, k++) power_x[k] = degree - j, power_y[k] = j;
+    }
+    memset(gram, 0, FIELDS * FIELDS * sizeof *gram);
+    memset(plain, 0, SCALAR * SCALAR * sizeof *plain);
+    for (int i = 0; i < SCALAR - 1; i++) {
+        for (int j = 0; j < SCALAR - 1; j++) {
+            int k = moment_of(power_x[i] + power_x[j], power_y[i] + power_y[j]);
+            gram[i * FIELDS + j] = g->xx[k];
+            gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->xy[k];
+            gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->yy[k];
+            plain[i * SCALAR + j] = g->plain[k];
         }
+    }
+    for (int i = 0; i < SCALAR; i++) {
         for (int j = 0; j < DENSE; j++) {
             gram[i * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + i] = g->xd[i][j];
             gram[(SCALAR + i) * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + SCALAR + i] = g->yd[i][j];
@@ -530,6 +558,11 @@ KERNEL int64_t joint_off_points(
         double pull[3] = {0.0, 0.0, 0.0};
         for (int64_t k = m->point_offsets[p]; k < m->point_offsets[p + 1]; k++) {
             int64_t row = m->by_point[k];
+            if (k + 2 * AHEAD < m->point_offsets[num_points]) {
+                int64_t later = m->by_point[k + 2 * AHEAD];
+                SOON(m->design + later * 2 * m->width + 3), SOON(m->design + (later * 2 + 1) * m->width + 5);
+                SOON(weight + later), SOON(values + 2 * later);
+            }
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
             double w = weight[row];
             for (int i = 0; i < 3; i++) pull[i] += (jx[i] * values[2 * row] + jy[i] * values[2 * row + 1]) * w;

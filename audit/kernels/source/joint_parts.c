@@ -111,3 +111,17 @@ KERNEL int64_t joint_design(
     }
     return DONE;
 }
+
+/* by_point (n): rows by point, each point's in order; offsets (num_points + 1): where a point begins. */
+KERNEL int64_t joint_by_point(int64_t n, int64_t num_points, const int64_t *point_idx, int64_t *by_point, int64_t *offsets) {
+    for (int64_t row = 0; row < n; row++) {
+        if (point_idx[row] < 0 || point_idx[row] >= num_points) return NEEDS_NUMPY;
+    }
+    memset(offsets, 0, (size_t)(num_points + 1) * sizeof *offsets);
+    for (int64_t row = 0; row < n; row++) offsets[point_idx[row] + 1]++;
+    for (int64_t point = 0; point < num_points; point++) offsets[point + 1] += offsets[point];
+    for (int64_t row = 0; row < n; row++) by_point[offsets[point_idx[row]]++] = row;
+    for (int64_t point = num_points; point > 0; point--) offsets[point] = offsets[point - 1];
+    offsets[0] = 0;
+    return DONE;
+}
