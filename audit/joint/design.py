@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class Design:
     def _made(self, image_idx: int, chosen: slice | IntArray) -> FloatArray:
         source = self.source[self._rows(image_idx)][chosen]
         out = np.zeros((source.size, 2, self.layout.width))
-        _fill(out, self.model, self.residuals, self.layout, (image_idx, source))
+        _fill(out, self.model, self.residuals, self.layout, _Rows(image_idx, source, None))
         return out
 
 
@@ -91,24 +91,22 @@ def make_design(
     inverses = np.linalg.pinv(rotation_from_quat(model.images.quat_cam_from_world_wxyz[images]))  # all at once
     for image, inverse in zip(images.tolist(), inverses, strict=True):
         own = source[int(offsets[image]) : int(offsets[image + 1])]
-        _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, (image, own), inverse)
+        _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, _Rows(image, own, inverse))
     return Design(model, residuals, layout, source, offsets, kept, first)
 
 
-def _fill(
-    own: FloatArray,
-    model: SparseModel,
-    residuals: ModelResiduals,
-    layout: Layout,
-    which: tuple[int, IntArray],
-    world_from_cam: FloatArray | None = None,
-) -> None:
-    """Write the rows of an image's chosen observations, columns of ModelResiduals.
+class _Rows(NamedTuple):
+    """Chosen observations (n,) of an image, columns of ModelResiduals; (3, 3) inverse of its rotation if at hand."""
 
-    ``world_from_cam`` (3, 3): the inverse of the image's rotation, where it is at hand.
-    """
-    image, source = which
-    inputs = _inputs(model, residuals, layout, which, world_from_cam)
+    image_idx: int
+    source: IntArray
+    world_from_cam: FloatArray | None
+
+
+def _fill(own: FloatArray, model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows) -> None:
+    """Write the rows of an image's chosen observations."""
+    image, source, _ = rows
+    inputs = _inputs(model, residuals, layout, rows)
     if inputs is not None and fill_design(own, inputs):
         return
     projected = image_inliers(model, residuals, image, source - residuals.offsets[image]).projected
@@ -121,15 +119,9 @@ def _fill(
         own[~np.isfinite(own)] = 0.0
 
 
-def _inputs(
-    model: SparseModel,
-    residuals: ModelResiduals,
-    layout: Layout,
-    which: tuple[int, IntArray],
-    world_from_cam: FloatArray | None,
-) -> DesignInputs | None:
+def _inputs(model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows) -> DesignInputs | None:
     """What the compiled design is made of; None for numpy: panoramas have columns that are not finite."""
-    image_idx, source = which
+    image_idx, source, world_from_cam = rows
     image = model.image(image_idx)
     camera = image.camera
     if not kernels_in_use() or camera is None or camera.model.is_spherical:

@@ -51,7 +51,7 @@ def test_group(scores: CandidateScores, own: slice, root: FloatArray, *, sigma_p
     root : L of `group_root`
     """
     kept = np.ones((1, len(root)), dtype=bool)
-    return _judged([scores], own, root[None], kept, np.array([sigma_px]), np.array([rms_px]))[0]
+    return _judged([scores], own, (root[None], kept), np.array([sigma_px]), np.array([rms_px]))[0]
 
 
 def test_groups(
@@ -63,7 +63,7 @@ def test_groups(
     ----------
     scores : of each image, with the same fields        sigma_px, rms_px : of each image
     """
-    return _judged(scores, own, *_roots(scores, own), sigma_px, rms_px) if scores else []
+    return _judged(scores, own, _roots(scores, own), sigma_px, rms_px) if scores else []
 
 
 def _roots(scores: Sequence[CandidateScores], own: slice) -> tuple[FloatArray, BoolArray]:
@@ -82,11 +82,11 @@ def _roots(scores: Sequence[CandidateScores], own: slice) -> tuple[FloatArray, B
 def _judged(
     scores: Sequence[CandidateScores],
     own: slice,
-    roots: FloatArray,
-    kept: BoolArray,
+    directions: tuple[FloatArray, BoolArray],
     sigma_px: FloatArray,
     rms_px: FloatArray,
 ) -> list[GroupTest]:
+    roots, kept = directions
     finite = [bool(np.isfinite(each.gram[own, own]).all()) for each in scores]
     n = np.array([each.num_observations for each in scores])
     clusters, ranks = np.minimum([each.num_tracks for each in scores], n), kept.sum(axis=1)

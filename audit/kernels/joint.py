@@ -60,6 +60,24 @@ class FirstHalf(NamedTuple):
     views: tuple[SmallIntArray, IntArray, FloatArray]
 
 
+class _Space(NamedTuple):
+    """Arrays that `joint_first` writes to, in its order."""
+
+    view: SmallIntArray
+    own: SmallIntArray
+    around: IntArray
+    start: IntArray
+    num: IntArray
+    absorbing: FloatArray
+    right: FloatArray
+    gram: FloatArray
+    plain: FloatArray
+    dense_plain: FloatArray
+    score: FloatArray
+    track_score: FloatArray
+    scores: FloatArray
+
+
 class NormalOfImage(NamedTuple):
     """What an image adds to the normal equations.
 
@@ -207,39 +225,34 @@ class JointSums:
         track, num_tracks = tracks
         if function is None or scalar.shape != (n, SCALAR) or dense.shape != (n, 2, DENSE) or track.shape != (n,):
             return None
-        most = min(views, self._num_images)
-        view, own = np.empty((2, views), dtype=np.int32)
-        around, start, num = (np.empty(size, dtype=np.int64) for size in (most, most + 1, 2))
-        max_rows, max_scores = most * self.width, views * self.width
-        if self._held["extra"].size > 1:
-            max_rows, max_scores = int(np.sort(self._widths)[-most:].sum()), views * int(self._widths.max())
-        right = np.empty((max_rows, FIELDS))
-        gram, plain, dense_plain = (np.empty((size, size)) for size in (FIELDS, SCALAR, DENSE))
-        score, track_score, absorbing = np.empty(FIELDS), np.empty((num_tracks, FIELDS)), np.empty((n, 3, 2))
-        scores = np.empty(max_scores)
+        space = self._space(views, n, num_tracks)
         status = function(
             ctypes.byref(self._model),
-            *(
-                np.zeros(self._num_images, dtype=np.int64),
-                image_idx,
-                scalar,
-                dense,
-                track,
-                num_tracks,
-                max_rows,
-                view,
-                own,
-                around,
-                start,
-                num,
-            ),
-            *(absorbing, right, gram, plain, dense_plain, score, track_score, scores, max_scores),
+            *(np.zeros(self._num_images, dtype=np.int64), image_idx, scalar, dense, track, num_tracks),
+            *(len(space.right), space.view, space.own, space.around, space.start, space.num, space.absorbing),
+            *(space.right, space.gram, space.plain, space.dense_plain, space.score, space.track_score),
+            *(space.scores, space.scores.size),
         )
         if status != DONE:
             return None
-        count, rows = num.tolist()
-        around, start = around[:count], start[: count + 1]
-        return FirstHalf(around, right[:rows], gram, plain, dense_plain, score, track_score, (own, start, scores))
+        count, rows = space.num.tolist()
+        around, start = space.around[:count], space.start[: count + 1]
+        sums = space.gram, space.plain, space.dense_plain, space.score, space.track_score
+        return FirstHalf(around, space.right[:rows], *sums, (space.own, start, space.scores))
+
+    def _space(self, num_views: int, num_rows: int, num_tracks: int) -> _Space:
+        """Room for what `first` finds of an image."""
+        most = min(num_views, self._num_images)
+        max_rows, max_scores = most * self.width, num_views * self.width
+        if self._held["extra"].size > 1:
+            max_rows, max_scores = int(np.sort(self._widths)[-most:].sum()), num_views * int(self._widths.max())
+        view, own = np.empty((2, num_views), dtype=np.int32)
+        around, start, num = (np.empty(size, dtype=np.int64) for size in (most, most + 1, 2))
+        absorbing, right = np.empty((num_rows, 3, 2)), np.empty((max_rows, FIELDS))
+        gram, plain, dense_plain = (np.empty((size, size)) for size in (FIELDS, SCALAR, DENSE))
+        score, track_score, scores = np.empty(FIELDS), np.empty((num_tracks, FIELDS)), np.empty(max_scores)
+        found = gram, plain, dense_plain, score, track_score, scores
+        return _Space(view, own, around, start, num, absorbing, right, *found)
 
     def second(self, first: FirstHalf, tracks: tuple[SmallIntArray, int], moved: FloatArray) -> None:
         """Second half: subtract from ``first.track_score`` what the base does, ``moved`` (rows, F) = T B, in place."""

@@ -123,7 +123,8 @@ TARGETS: Final = (
         "audit/joint/group_test.py",
         ROUNDS,
         (
-            *("test_group", "group_root", "_quadratic_form", "KEPT_EIGENVALUE", "MIN_OBSERVATIONS_PER_RANK"),
+            *("test_group", "group_root", "_roots", "_judged", "_quadratic_forms", "_cholesky"),
+            *("KEPT_EIGENVALUE", "MIN_OBSERVATIONS_PER_RANK"),
             "MAX_EFFECT_OVER_RMS",
         ),
     ),
