@@ -1,6 +1,6 @@
 /* Who sees which point, who should, and what pairs of images have in common. Twins: audit/witnesses/covisibility.py,
  * should_see.py, fold.py. All indices are in range: the Python module has looked. */
-#include "kernel.h"
+#include "lanes.h"
 
 static int ascending(const void *a, const void *b)
 {
@@ -8,18 +8,19 @@ static int ascending(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-enum { LAST = 1 << 30 }; /* on the last image of each point, while pairs are counted */
+enum { LAST = 1 << 30, AHEAD = 16 }; /* LAST: on the last image of each point, while pairs are counted */
 
 /* Turns (n,) observations round: next[p] moves to the end of the images that see point p, ascending, each once, which
  * start at starts[p] of seen_image (n,). place: (n,) where the image stands in it, -1 where it has been before. */
 static void turn_round(int64_t num_images, const int64_t *offsets, const int64_t *point_idx, const int64_t *starts,
-                       int64_t *next, int32_t *seen_image, int32_t *place)
+                       int32_t *next, int32_t *seen_image, int32_t *place)
 {
     for (int64_t i = 0; i < num_images; i++)
         for (int64_t k = offsets[i]; k < offsets[i + 1]; k++) {
-            const int64_t p = point_idx[k], at = next[p];
-            const int again = at > starts[p] && seen_image[at - 1] == i;
-            place[k] = again ? -1 : (int32_t)at;
+            const int64_t p = point_idx[k];
+            const int32_t at = next[p];
+            const int again = at && seen_image[at - 1] == i && at > starts[p];
+            place[k] = again ? -1 : at;
             if (!again) {
                 seen_image[at] = (int32_t)i;
                 next[p]++;
@@ -37,13 +38,16 @@ static void count_shared(int64_t i, const int32_t *place, int64_t size, const in
                          int64_t *touched, Pairs *pairs)
 {
     int64_t num_touched = 0;
-    for (int64_t k = 0; k < size; k++)
+    for (int64_t k = 0; k < size; k++) {
+        if (k + AHEAD < size && place[k + AHEAD] >= 0)
+            __builtin_prefetch(seen_image + place[k + AHEAD]);
         if (place[k] >= 0)
             for (int64_t o = place[k]; !(seen_image[o] & LAST);) {
                 const int32_t other = seen_image[++o] & ~LAST;
                 if (!row[other]++)
                     touched[num_touched++] = other;
             }
+    }
     qsort(touched, num_touched, sizeof *touched, ascending);
     for (int64_t t = 0; t < num_touched; t++, pairs->num++) {
         if (pairs->num < pairs->capacity) {
@@ -62,8 +66,8 @@ KERNEL int64_t witness_shared(int64_t num_images, int64_t num_points, const int6
                               int64_t *seen_offsets, int32_t *seen_image, int64_t capacity, int64_t *first,
                               int64_t *second, int64_t *num_shared)
 {
-    int64_t *next = malloc((num_points + 1) * sizeof *next), *touched = malloc((num_images + 1) * sizeof *touched);
-    int64_t *row = calloc(num_images + 1, sizeof *row);
+    int64_t *touched = malloc((num_images + 1) * sizeof *touched), *row = calloc(num_images + 1, sizeof *row);
+    int32_t *next = malloc((num_points + 1) * sizeof *next);
     int32_t *place = malloc((offsets[num_images] + 1) * sizeof *place);
     Pairs pairs = {next && touched && row && place ? 0 : -1, capacity, first, second, num_shared};
     if (!pairs.num) {
@@ -72,7 +76,8 @@ KERNEL int64_t witness_shared(int64_t num_images, int64_t num_points, const int6
             seen_offsets[point_idx[k] + 1]++;
         for (int64_t p = 0; p < num_points; p++)
             seen_offsets[p + 1] += seen_offsets[p];
-        memcpy(next, seen_offsets, (num_points + 1) * sizeof *next);
+        for (int64_t p = 0; p < num_points; p++)
+            next[p] = (int32_t)seen_offsets[p];
         turn_round(num_images, offsets, point_idx, seen_offsets, next, seen_image, place);
         for (int64_t p = 0; p < num_points; p++)
             if (next[p] > seen_offsets[p])
@@ -149,97 +154,102 @@ KERNEL int64_t witness_cuts(int64_t num, const int64_t *offsets, const int64_t *
     return num_bridges;
 }
 
-/* One image that sees a point: the point, the ray from it to the image, its length. */
+/* Who sees the points, image after image: those of image i begin at starts[i]. */
 typedef struct {
-    int64_t point;
-    double ray[3], distance;
-} Sight;
+    int64_t *starts; /* (I + 1,) */
+    double *numbers; /* four rows of ``room``: x, y, z of the ray from the point to the image, its length */
+    int32_t *point;
+    double *farthest; /* (I,) length */
+    int64_t room;
+} Sights;
 
-typedef struct {
-    int64_t num_points;
-    const double *xyz; /* (3, p) */
-    int64_t *ends;     /* (I + 1,): sights ends[i - 1] .. ends[i] are of image i, those of image 0 begin at 0 */
-    Sight *sights;
-    double *farthest; /* (I,) distance */
-    double reach, ratio, cosine;
-} Seen;
-
-/* What is known of the points that image j may see: its number where anything is, inside, sees, should see. */
-typedef struct {
-    int64_t image;
-    double ray[3], distance;
-    uint8_t inside, sees, should;
-} State;
-
-static void look(State *state, int64_t j, const double *x, const double *rotation, const double *centre,
-                 const double *limits)
+/* starts, farthest: zeros. offsets, seen_image, seen_ray, seen_distance: as of witness_should_see. */
+static void by_image(Sights *sights, int64_t num_images, int64_t num_points, const int64_t *offsets,
+                     const int64_t *seen_image, const double *seen_ray, const double *seen_distance)
 {
-    const double dx = x[0] - centre[0], dy = x[1] - centre[1], dz = x[2] - centre[2];
-    const double depth = rotation[6] * dx + rotation[7] * dy + rotation[8] * dz, limit = depth * limits[0];
-    state->image = j;
-    state->sees = state->should = 0;
-    state->inside = fabs(rotation[0] * dx + rotation[1] * dy + rotation[2] * dz) < limit * limits[1] &&
-                    fabs(rotation[3] * dx + rotation[4] * dy + rotation[5] * dz) < limit * limits[2] && depth > 0.0;
-    if (!state->inside)
-        return;
-    state->distance = sqrt(dx * dx + dy * dy + dz * dz);
-    const double length = state->distance > DBL_MIN ? state->distance : DBL_MIN;
-    state->ray[0] = -dx / length;
-    state->ray[1] = -dy / length;
-    state->ray[2] = -dz / length;
+    const int64_t num = offsets[num_points];
+    int64_t *starts = sights->starts;
+    for (int64_t o = 0; o < num; o++) {
+        starts[seen_image[o]]++;
+        if (seen_distance[o] > sights->farthest[seen_image[o]])
+            sights->farthest[seen_image[o]] = seen_distance[o];
+    }
+    for (int64_t i = 0, end = 0; i <= num_images; i++) /* ends, which move to the starts while they are filled */
+        end = starts[i] += end;
+    for (int64_t p = num_points - 1; p >= 0; p--)
+        for (int64_t o = offsets[p + 1] - 1; o >= offsets[p]; o--) {
+            const int64_t at = --starts[seen_image[o]];
+            sights->point[at] = (int32_t)p;
+            for (int a = 0; a < 3; a++)
+                sights->numbers[a * sights->room + at] = seen_ray[a * num + o];
+            sights->numbers[3 * sights->room + at] = seen_distance[o];
+        }
 }
 
-/* One image: every point that an image sees that stands close enough to it. */
-static void ask(const Seen *seen, State *states, uint64_t *found, int64_t j, int64_t num_images,
-                const double *rotation, const double *centre, const double *limits)
+/* How far apart two distances of a point may be, squared, and the cosine of the angle between its rays, squared. */
+typedef struct {
+    double sq_ratio, sq_cosine;
+} Alike;
+
+/* Of the points first .. last that one image sees those that another should see, whose centre is ``apart`` from its own:
+ * by the law of cosines. Returns how many. */
+WIDE static int64_t close_by(const Sights *sights, int64_t first, int64_t last, const double *apart, Alike alike,
+                             int32_t *found)
 {
-    for (int64_t i = 0; i < num_images; i++) {
-        double sq = 0.0;
-        for (int a = 0; a < 3; a++)
-            sq += (centre[3 * i + a] - centre[3 * j + a]) * (centre[3 * i + a] - centre[3 * j + a]);
-        const double nearest = sqrt(sq) / seen->reach;
-        if (!(nearest <= seen->farthest[i]))
-            continue;
-        for (const Sight *one = seen->sights + (i ? seen->ends[i - 1] : 0); one < seen->sights + seen->ends[i]; one++) {
-            if (!(one->distance >= nearest))
-                continue;
-            State *state = states + one->point;
-            if (state->image != j) {
-                const double *x = seen->xyz + one->point;
-                const double point[3] = {x[0], x[seen->num_points], x[2 * seen->num_points]};
-                look(state, j, point, rotation + 9 * j, centre + 3 * j, limits + 3 * j);
-            }
-            if (!state->inside)
-                continue;
-            if (i == j)
-                state->sees = state->should = 1;
-            else if (!state->should && state->distance < seen->ratio * one->distance &&
-                     state->distance * seen->ratio > one->distance)
-                state->should = one->ray[0] * state->ray[0] + one->ray[1] * state->ray[1] +
-                                    one->ray[2] * state->ray[2] > seen->cosine;
-            if (state->should)
-                found[one->point / 64] |= (uint64_t)1 << (one->point % 64);
+    const double *x = sights->numbers, *y = x + sights->room, *z = y + sights->room, *length = z + sights->room;
+    const double sq_apart = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2];
+    int64_t num = 0;
+    for (int64_t o = first; o < last; o += LANES) {
+        const Lanes there = load(length + o), sq_there = there * there;
+        const Lanes shift = load(x + o) * apart[0] + load(y + o) * apart[1] + load(z + o) * apart[2];
+        const Lanes along = there + shift, sq_own = sq_there + 2.0 * there * shift + sq_apart;
+        const LaneBits close = (sq_own < alike.sq_ratio * sq_there) & (sq_own * alike.sq_ratio > sq_there) &
+                               (along > 0.0) & (along * along > alike.sq_cosine * sq_own);
+        for (int l = 0; l < LANES; l++) {
+            found[num] = sights->point[o + l];
+            num += close[l] & (o + l < last);
         }
     }
+    return num;
 }
 
-/* The sights of all points, by image. ends: (I + 1,) zeros, farthest: (I,) zeros. */
-static void by_image(const Seen *seen, const int64_t *offsets, const int64_t *seen_image, const double *seen_ray,
-                     const double *seen_distance, int64_t num_images)
+/* The points that image j sees, or should see because of an image close by: bits of ``sees`` and ``should``. */
+static void ask(const Sights *sights, int64_t j, int64_t num_images, const double *centre, double reach, Alike alike,
+                int32_t *found, uint64_t *sees, uint64_t *should)
 {
-    const int64_t num = offsets[seen->num_points];
-    int64_t *starts = seen->ends; /* move to the ends while they are filled */
-    for (int64_t o = 0; o < num; o++) {
-        starts[seen_image[o] + 1]++;
-        if (seen_distance[o] > seen->farthest[seen_image[o]])
-            seen->farthest[seen_image[o]] = seen_distance[o];
+    for (int64_t o = sights->starts[j]; o < sights->starts[j + 1]; o++) {
+        sees[sights->point[o] / 64] |= (uint64_t)1 << (sights->point[o] % 64);
+        should[sights->point[o] / 64] |= (uint64_t)1 << (sights->point[o] % 64);
     }
-    for (int64_t i = 0; i < num_images; i++)
-        starts[i + 1] += starts[i];
-    for (int64_t p = 0; p < seen->num_points; p++)
-        for (int64_t o = offsets[p]; o < offsets[p + 1]; o++)
-            seen->sights[starts[seen_image[o]]++] =
-                (Sight){p, {seen_ray[o], seen_ray[num + o], seen_ray[2 * num + o]}, seen_distance[o]};
+    for (int64_t i = 0; i < num_images; i++) {
+        double apart[3], sq = 0.0;
+        for (int a = 0; a < 3; a++) {
+            apart[a] = centre[3 * j + a] - centre[3 * i + a];
+            sq += apart[a] * apart[a];
+        }
+        if (i == j || !(sqrt(sq) <= reach * sights->farthest[i]))
+            continue;
+        const int64_t num = close_by(sights, sights->starts[i], sights->starts[i + 1], apart, alike, found);
+        for (int64_t k = 0; k < num; k++)
+            should[found[k] / 64] |= (uint64_t)1 << (found[k] % 64);
+    }
+}
+
+/* Whether a point lies before an image and inside of its photo; the ray from it to the image, and its length. */
+static int is_inside(const double *point, const double *rotation, const double *centre, const double *limits,
+                     double *ray, double *distance)
+{
+    const double x = point[0] - centre[0], y = point[1] - centre[1], z = point[2] - centre[2];
+    const double depth = rotation[6] * x + rotation[7] * y + rotation[8] * z, limit = depth * limits[0];
+    if (!(fabs(rotation[0] * x + rotation[1] * y + rotation[2] * z) < limit * limits[1] &&
+          fabs(rotation[3] * x + rotation[4] * y + rotation[5] * z) < limit * limits[2] && depth > 0.0))
+        return 0;
+    *distance = sqrt(x * x + y * y + z * z);
+    const double length = *distance > DBL_MIN ? *distance : DBL_MIN;
+    ray[0] = -x / length;
+    ray[1] = -y / length;
+    ray[2] = -z / length;
+    return 1;
 }
 
 /* The points that each image should see, image after image, points ascending: (capacity,) each, ray (capacity, 3).
@@ -252,37 +262,43 @@ KERNEL int64_t witness_should_see(int64_t num_images, int64_t num_points, const 
                                   const double *limits, double reach, double ratio, double cosine, int64_t capacity,
                                   int64_t *point, int64_t *image, uint8_t *sees, double *ray, double *distance)
 {
-    const int64_t num_words = num_points / 64 + 1;
-    const Seen seen = {num_points, xyz, calloc(num_images + 1, sizeof(int64_t)),
-                       malloc((offsets[num_points] + 1) * sizeof(Sight)), calloc(num_images + 1, sizeof(double)),
-                       reach, ratio, cosine};
-    State *states = malloc((num_points + 1) * sizeof *states);
-    uint64_t *found = calloc(num_words, sizeof *found);
-    int64_t num = seen.ends && seen.sights && seen.farthest && states && found ? 0 : -1;
-    if (!num)
-        by_image(&seen, offsets, seen_image, seen_ray, seen_distance, num_images);
-    for (int64_t p = 0; !num && p < num_points; p++)
-        states[p].image = -1;
-    for (int64_t j = 0; num >= 0 && j < num_images; j++) {
+    const int64_t num_words = num_points / 64 + 1, room = offsets[num_points] + LANES;
+    const Alike alike = {ratio * ratio, cosine * cosine};
+    Sights sights = {calloc(num_images + 1, sizeof(int64_t)), calloc(4 * room, sizeof(double)),
+                     calloc(room, sizeof(int32_t)), calloc(num_images + 1, sizeof(double)), room};
+    uint64_t *saw = calloc(num_words, sizeof *saw), *should = calloc(num_words, sizeof *should);
+    int32_t *found = malloc(room * sizeof *found);
+    const int is_ready = sights.starts && sights.numbers && sights.point && sights.farthest && saw && should && found;
+    int64_t num = is_ready ? 0 : -1;
+    if (is_ready)
+        by_image(&sights, num_images, num_points, offsets, seen_image, seen_ray, seen_distance);
+    for (int64_t j = 0; is_ready && j < num_images; j++) {
         if (!usable[j])
             continue;
-        ask(&seen, states, found, j, num_images, rotation, centre, limits);
-        for (int64_t w = 0; w < num_words; w++)
-            for (; found[w]; found[w] &= found[w] - 1, num++) {
-                const int64_t p = 64 * w + __builtin_ctzll(found[w]);
-                if (num >= capacity)
+        ask(&sights, j, num_images, centre, reach, alike, found, saw, should);
+        for (int64_t w = 0; w < num_words; saw[w++] = 0)
+            for (; should[w]; should[w] &= should[w] - 1) {
+                const int64_t p = 64 * w + __builtin_ctzll(should[w]);
+                const double x[3] = {xyz[p], xyz[num_points + p], xyz[2 * num_points + p]};
+                double way[3], length;
+                if (!is_inside(x, rotation + 9 * j, centre + 3 * j, limits + 3 * j, way, &length))
                     continue;
-                point[num] = p;
-                image[num] = j;
-                sees[num] = states[p].sees;
-                memcpy(ray + 3 * num, states[p].ray, sizeof states[p].ray);
-                distance[num] = states[p].distance;
+                if (num < capacity) {
+                    point[num] = p;
+                    image[num] = j;
+                    sees[num] = (saw[w] >> (p % 64)) & 1;
+                    memcpy(ray + 3 * num, way, sizeof way);
+                    distance[num] = length;
+                }
+                num++;
             }
     }
-    free(seen.ends);
-    free(seen.sights);
-    free(seen.farthest);
-    free(states);
+    free(sights.starts);
+    free(sights.numbers);
+    free(sights.point);
+    free(sights.farthest);
+    free(saw);
+    free(should);
     free(found);
     return num;
 }
