@@ -34,7 +34,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from scripts import build_kernels  # noqa: E402 - the folder that holds it is on the path only now
 
-SANITIZE: Final = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-g", "-O1")
+SANITIZE: Final = (
+    "-fsanitize=address,undefined,float-cast-overflow",
+    "-fno-sanitize-recover=all",
+    "-g",
+    "-O1",
+    "-DSFM_ONE_CLONE",
+)
 RUNTIME: Final = "libasan.so"
 SOURCES_OF: Final = "audit/kernels/source"
 NO_KERNEL: Final = frozenset({"sfm_audit_sources"})
@@ -61,7 +67,7 @@ TRUSTED: Final[dict[str, frozenset[int]]] = {
 SPECIALS: Final = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1.8e308, -1.8e308, 1e300, 5e-324, 1e-200, 1e17, -1.0, 1.0)
 KEPT: Final = 12  # calls of each kernel that are kept from the audits
 LIMIT_SECONDS: Final = 120.0  # of one call: a loop that NaN never ends
-QUICK_ROUNDS: Final = 400
+QUICK_ROUNDS: Final = 120
 CHECK_LEAKS: Final = "__lsan_do_recoverable_leak_check"
 _LEAK: Final = re.compile(r"^(?:Direct|Indirect) leak .*?(?:\n\n|\Z)", re.MULTILINE | re.DOTALL)
 

@@ -74,7 +74,11 @@ def test_a_nudged_model_is_the_same_to_rounding(tmp_path):
     model = dataclasses.replace(model, images=dataclasses.replace(model.images, quat_cam_from_world_wxyz=quat))
     other = compare_paths.nudged(model)
     one, two = (
-        np.einsum("iab,pb->ipa", rotation_from_quat(m.images.quat_cam_from_world_wxyz), m.points.xyz_world)
+        np.einsum(
+            "iab,pb->ipa",
+            rotation_from_quat(m.images.quat_cam_from_world_wxyz),
+            m.points.xyz_world[m.observations.point_idx],
+        )
         for m in (model, other)
     )
     assert_allclose(one, two, rtol=0.0, atol=1e-14)

@@ -56,7 +56,7 @@ def test_a_model_gets_its_share_of_the_processes(sizes, jobs, shares):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Thirty images, some of them wrong, so that peeling has something to do."""
+    """Thirty images, some of them wrong, so that somebody is excluded."""
     root = tmp_path_factory.mktemp("scene")
     write_dataset(root, DatasetSpec(1, 30, linked=(250, 250), keypoints=300, defects=0.1), 1)
     return scene_folder(root, 0)
