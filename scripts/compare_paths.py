@@ -47,6 +47,8 @@ AT_THE_RANK: Final = 5e-6
 NEAR_ZERO: Final = 1e-4
 SMALLEST: Final = 1e-5
 """Numbers below are compared as if they were that large."""
+OF_THE_ORDER_OF_ONE: Final = ("skewness", "kurtosis")
+"""Columns whose zero is a sum of cubes that cancel: they are compared as if they were 1."""
 OWN_ROUNDING: Final = 100.0
 MEANINGLESS: Final = 1e-3
 """A number of which numpy's own rounding moves more than that is rounding: whether it is null may differ too."""
@@ -161,7 +163,8 @@ def _compare_column(where: str, columns: Sequence[Column], out: Compared) -> Non
     """Compare one column of both paths; the third is that of the nudged model."""
     (words, a), (other_words, b), (third_words, c) = columns
     out.num_values += max(len(words), len(a))
-    own = float(np.max(relative_difference(a, c), initial=0.0)) if a.shape == c.shape else np.inf
+    smallest = 1.0 if where.startswith(OF_THE_ORDER_OF_ONE) else SMALLEST
+    own = float(np.max(relative_difference(a, c, smallest), initial=0.0)) if a.shape == c.shape else np.inf
     wrong = _other_words(words, other_words, None if own > MEANINGLESS else third_words)
     if wrong is not None:
         out.faults.append(f"{where}: {words[wrong]!r} by numpy, {other_words[wrong]!r} by kernels")
@@ -169,7 +172,7 @@ def _compare_column(where: str, columns: Sequence[Column], out: Compared) -> Non
     if a.shape != b.shape:  # a null here or there, as numpy itself has it
         out.num_beyond += abs(len(a) - len(b))
         return
-    off = relative_difference(a, b)
+    off = relative_difference(a, b, smallest)
     out.num_equal += max(len(words) - len(a), 0) + int(np.count_nonzero(off == 0.0))
     if not off.any():
         return
@@ -217,13 +220,15 @@ def _unit(number: str) -> float:
     return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
 
 
-def relative_difference(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def relative_difference(
+    a: np.ndarray[Any, Any], b: np.ndarray[Any, Any], smallest: float = SMALLEST
+) -> np.ndarray[Any, Any]:
     """Return by how much numbers differ, in units of the larger, or of what is near zero in their column."""
     with np.errstate(all="ignore"):
         size = np.maximum(np.abs(a), np.abs(b))
         finite = size[np.isfinite(size)]
         floor = NEAR_ZERO * float(np.median(finite)) if finite.size else 0.0
-        off = np.abs(a - b) / np.maximum(np.maximum(size, floor), SMALLEST)
+        off = np.abs(a - b) / np.maximum(np.maximum(size, floor), smallest)
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     return np.where(same, 0.0, np.where(np.isnan(off), np.inf, off))
 

@@ -21,10 +21,9 @@ _MAX_ITERATIONS = 60
 _STEP = 1.0 / 32.0  # node distance of the quantile tables in w
 _TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
 _NUM_CELLS = round(_TABLE_END / _STEP)
-_TINY = float(np.finfo(np.float64).tiny)
 LAST_STEP = 1e-6  # in ln f
 MIN_SLOPE = 1e-3  # of the robust variance in ln f, at which a step of Newton's is one
-_MANY, _EVERY = 256, 8  # observations, from which on every 8th says where to begin
+_MANY, _EVERY, _ROUGHLY = 256, 8, 0.02  # observations, from which on every 8th says, to 2 % of f, where to begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +81,13 @@ class StudentToNormal:
     """
 
     def __init__(self, nu_values: FloatArray) -> None:
-        """Tabulate; coefficients: (v * 193, 4) of the cubics of z / w in cells of w, the last of which begins at 6."""
+        """Tabulate.
+
+        coefficients: (v * 193, 4) of the cubics of z / w in cells of w, the last of which begins at 6.
+        log_front: (v,) logarithm of the density of t over that of z, both at 0.
+        """
         self.nu_values = nu_values
+        self.log_front = _log_front(nu_values)
         nodes: FloatArray = np.arange(_NUM_CELLS + 2, dtype=np.float64) * _STEP
         ratio = np.empty((len(nu_values), nodes.size))
         slope = np.empty_like(ratio)
@@ -97,26 +101,31 @@ class StudentToNormal:
 
     def __call__(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> FloatArray:
         """Transform t (m,) with degrees of freedom nu (m,) = nu_values[nu_row]."""
-        return self.growing(t, nu_row, nu)[0]
+        return self.with_w_sq(t, nu_row, nu)[0]
 
-    def growing(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z (m,) and d z / d ln t, which is 0 where |w| > 6 and nobody has asked."""
-        t_sq = t * t
-        w = np.sqrt(nu * np.log1p(t_sq / nu))
+    def with_w_sq(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z and w^2 (m,) of t."""
+        w_sq = t * t
+        w_sq /= nu
+        np.log1p(w_sq, out=w_sq)
+        w_sq *= nu
+        w = np.sqrt(w_sq)
         cell_position = w * (1.0 / _STEP)
         outside = np.flatnonzero(cell_position >= _NUM_CELLS)
         np.minimum(cell_position, _NUM_CELLS, out=cell_position)
         cell = cell_position.astype(np.int64)
         c0, c1, c2, c3 = self.coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0).T
         fraction = np.subtract(cell_position, cell, out=cell_position)
-        ratio = ((c3 * fraction + c2) * fraction + c1) * fraction + c0
-        growth = ((3.0 * c3 * fraction + 2.0 * c2) * fraction + c1) * (w * (1.0 / _STEP))
-        growth += ratio
-        growth *= nu * t_sq / ((nu + t_sq) * np.maximum(w, _TINY))  # d w / d ln t
-        z = np.copysign(w * ratio, t)
+        w *= ((c3 * fraction + c2) * fraction + c1) * fraction + c0
+        z = np.copysign(w, t, out=w)
         if outside.size:
-            z[outside], growth[outside] = student_to_normal(t[outside], nu[outside]), 0.0
-        return z, np.copysign(growth, t)
+            z[outside] = student_to_normal(t[outside], nu[outside])
+        return z, w_sq
+
+
+def _log_front(nu: FloatArray) -> FloatArray:
+    """Logarithm of the density of Student's t over that of a normal number, both at 0."""
+    return np.asarray(special.gammaln(0.5 * (nu + 1.0)) - special.gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu))
 
 
 def _ratio_and_slope(nu: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -124,8 +133,7 @@ def _ratio_and_slope(nu: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
     inner = w[1:]
     t = np.sqrt(nu * np.expm1(inner**2 / nu))
     z = student_to_normal(t, np.full_like(t, nu))
-    log_density_t = special.gammaln(0.5 * (nu + 1)) - special.gammaln(0.5 * nu) - 0.5 * math.log(nu * math.pi)
-    log_ratio_at_zero = log_density_t + 0.5 * math.log(2 * math.pi)
+    log_ratio_at_zero = float(_log_front(np.array([nu]))[0])
     # dz / dw = f_T(t) dt/dw / phi(z), with dt/dw = w (1 + t^2 / nu) / t and f_T ~ exp(-(nu + 1) w^2 / (2 nu))
     log_pdf = log_ratio_at_zero - 0.5 * (nu + 1) / nu * inner**2 + 0.5 * z * z
     dz_dw = np.exp(log_pdf + inner**2 / nu) * inner / t
@@ -164,6 +172,21 @@ class StandardisedImage:
     z: FloatArray
     factor: float
     converged: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observations:
+    """What does not change while f is looked for: t (2, m) at f = 1 and nu (m,); of both axes (2 m,) what tables need.
+
+    half_power: (nu + 1) / (2 nu).
+    """
+
+    t: FloatArray
+    nu: FloatArray
+    rows: Int32Array
+    both_nu: FloatArray
+    log_front: FloatArray
+    half_power: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,24 +240,24 @@ class TrackStandardiser:
             return StandardisedImage(np.full(t.T.shape, np.nan), math.nan, converged=False)
         start = 0.0
         if nu.size >= _MANY:
-            rough = self._solve((t[:, ::_EVERY], nu_row[::_EVERY], nu[::_EVERY]), 0.0, 1e-3)
+            some = self._observations(t[:, ::_EVERY], nu_row[::_EVERY], nu[::_EVERY])
+            rough = self._solve(some, 0.0, _ROUGHLY)
             start = rough.log_f + rough.move if rough.converged else 0.0
-        found = self._solve((t, nu_row, nu), start, LAST_STEP)
-        z = found.z - found.growth * found.move
-        log_f = found.log_f + found.move
-        axis, row = np.nonzero((found.growth == 0.0) & (z != 0.0))
-        if row.size:
-            exact = self.transform(t[:, row] * math.exp(-log_f), nu_row[row], nu[row])[0]
-            z[axis, row] = exact[axis, np.arange(row.size)]
-        return StandardisedImage(np.ascontiguousarray(z.T), math.exp(log_f), found.converged)
+        found = self._solve(self._observations(t, nu_row, nu), start, LAST_STEP)
+        z = np.subtract(found.z, found.growth * found.move).T
+        return StandardisedImage(np.ascontiguousarray(z), math.exp(found.log_f + found.move), found.converged)
 
-    def _solve(self, image: tuple[FloatArray, Int32Array, FloatArray], log_f: float, tolerance: float) -> _Solution:
+    def _observations(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> _Observations:
+        rows = np.concatenate([nu_row, nu_row + len(self.to_normal.nu_values) // 2])
+        both = np.concatenate([nu, nu + 1.0])
+        return _Observations(t, nu, rows, both, self.to_normal.log_front[rows], 0.5 + 0.5 / both)
+
+    def _solve(self, image: _Observations, log_f: float, tolerance: float) -> _Solution:
         """Newton in ln f from ``log_f`` until a step is smaller than ``tolerance``; that step is not taken."""
-        t, nu_row, nu = image
         low, high = -math.inf, math.inf
         z, growth = np.empty((2, 0)), np.empty((2, 0))
         for _ in range(_MAX_ITERATIONS):
-            z, growth = self.transform(t * math.exp(-log_f), nu_row, nu)
+            z, growth = self._transform(image, image.t * math.exp(-log_f))
             excess, slope = robust_excess(z, growth)
             low, high = (log_f, high) if excess > 0 else (low, log_f)
             step = float(excess / slope) if slope > MIN_SLOPE else math.copysign(math.inf, excess)
@@ -246,18 +269,31 @@ class TrackStandardiser:
     def transform_stack(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z and d z / d ln t (B, m, 2) of t (B, 2, m) with the degrees of freedom nu (B, m)."""
         flat = np.ascontiguousarray(t.transpose(1, 0, 2)).reshape(2, -1)
-        z, growth = self.transform(flat, nu_row.reshape(-1), nu.reshape(-1))
+        z, growth = self._transform(self._observations(flat, nu_row.reshape(-1), nu.reshape(-1)), flat)
         return z.reshape(2, *nu.shape).transpose(1, 2, 0), growth.reshape(2, *nu.shape).transpose(1, 2, 0)
 
-    def transform(self, t: FloatArray, nu_row: Int32Array, nu: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z and d z / d ln t (2, m) of t (2, m) with the degrees of freedom nu (m,) = nu_values[nu_row]."""
-        rest = nu + t[0] * t[0]
-        given = np.stack([t[0], t[1] * np.sqrt((nu + 1.0) / rest)])
-        rows = np.stack([nu_row, nu_row + len(self.to_normal.nu_values) // 2])
-        both = self.to_normal.growing(given.reshape(-1), rows.reshape(-1), np.stack([nu, nu + 1.0]).reshape(-1))
-        z, growth = both[0].reshape(2, -1), both[1].reshape(2, -1)
-        growth[1] *= nu / rest  # the scale of y grows with x
-        return z, growth
+    def _transform(self, image: _Observations, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z and d z / d ln t (2, m) of t (2, m).
+
+        d z / d t is the density of t over that of z at the two; that of t is in proportion to
+        exp(-(nu + 1) / (2 nu) w^2).
+        """
+        rest = t[0] * t[0]
+        rest += image.nu
+        given = t.copy()
+        given[1] *= np.sqrt((image.nu + 1.0) / rest)
+        given = given.reshape(-1)
+        z, w_sq = self.to_normal.with_w_sq(given, image.rows, image.both_nu)
+        w_sq *= image.half_power
+        growth = 0.5 * z
+        growth *= z
+        growth -= w_sq
+        growth += image.log_front
+        np.exp(growth, out=growth)
+        growth *= given
+        own = growth.reshape(2, -1)
+        own[1] *= image.nu / rest  # the scale of y grows with x
+        return z.reshape(2, -1), own
 
 
 def robust_excess(z: FloatArray, growth: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -483,7 +483,7 @@ INLINE int noise_of(Image *image, double out[NOISE_COLUMNS], uint8_t *outside)
 {
     const int64_t m = image->m;
     double log_f = 0.0, move = 0.0;
-    if (m >= 4 * BLOCK && !solve(image, 8, 1e-3, &log_f, &move))
+    if (m >= 4 * BLOCK && !solve(image, 8, 0.02, &log_f, &move))
         log_f = move = 0.0;
     log_f += move;
     if (!solve(image, 1, 1e-6, &log_f, &move))
