@@ -118,12 +118,13 @@ def pose_columns(joint: JointAudit, image_idx: int, names: Sequence[str]) -> dic
 
 def below_diagonal(correlation: FloatArray) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
     """Return the values below the diagonal of (q, q), row by row; masked where they are not known."""
-    values = correlation[_below_diagonal(len(correlation))]
+    values = correlation[below_diagonal_of(len(correlation))]
     return np.ma.masked_array(values, ~np.isfinite(values))
 
 
 @lru_cache(maxsize=64)
-def _below_diagonal(size: int) -> tuple[IntArray, IntArray]:
+def below_diagonal_of(size: int) -> tuple[IntArray, IntArray]:
+    """Return the places below the diagonal of (q, q), row by row."""
     return np.tril_indices(size, -1)
 
 

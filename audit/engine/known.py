@@ -33,6 +33,7 @@ from sfm_audit.audit.misfit import fitted_param_idxs
 from sfm_audit.audit.table.words import GROUPS, MisfitStatus, Reason
 from sfm_audit.audit.witnesses.asking import Outside
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.camera_models import BY_ID
 from sfm_audit.loaders.model import SparseModel
 
 _in_order: Final = itemgetter(*GROUPS)
@@ -98,7 +99,7 @@ def measured_of(facts: ModelFacts, image_idxs: range, noise: MeasuredNoise, larg
         camera=_camera(qualities, known, size_px, steps),
         largest_residual_px=largest_px,
         longer_side_px=size_px.max(axis=1),
-        unusable=_unusable(model, image_idxs),
+        unusable=_unusable(model, image_idxs, known),
         remarks={},
         parts=_parts(consistency, image_idxs),
         own=_own(facts, images, known, steps),
@@ -127,11 +128,13 @@ def _steps(facts: ModelFacts, images: IntArray, known: BoolArray) -> list[Camera
     return [steps.get(camera) if takes else None for camera, takes in zip(cameras, part, strict=True)]
 
 
-def _unusable(model: SparseModel, image_idxs: range) -> dict[int, Reason]:
-    """By row what makes it impossible to project any point."""
+def _unusable(model: SparseModel, image_idxs: range, known: BoolArray) -> dict[int, Reason]:
+    """By row what makes it impossible to project any point; nothing does where the camera has been measured."""
     images = slice(image_idxs.start, image_idxs.stop)
     camera_idx = model.images.camera_idx[images]
-    usable = {c: c >= 0 and is_usable(model.camera(c)) for c in np.unique(camera_idx).tolist()}
+    usable = dict.fromkeys(camera_idx[known].tolist(), True)
+    for c in set(camera_idx[~known].tolist()) - set(usable):
+        usable[c] = c >= 0 and is_usable(model.camera(c))
     sane = is_sane(model.images.quat_cam_from_world_wxyz[images]).all(axis=1)
     sane &= is_sane(model.images.translation_cam_from_world[images]).all(axis=1)
     sane &= np.array([usable[c] for c in camera_idx.tolist()], dtype=bool)
@@ -163,11 +166,12 @@ def _parts(consistency: ModelConsistency, image_idxs: range) -> MeasuredParts:
 def _own(facts: ModelFacts, images: IntArray, known: BoolArray, steps: Sequence[CameraStep | None]) -> MeasuredOwn:
     """The own parameters of each image's camera; images of one camera have one record."""
     records = [None if step is None else facts.own[step.camera_idx] for step in steps]
-    model = facts.model
-    cameras = model.images.camera_idx[images].tolist()
-    has = {c: c >= 0 and bool(fitted_param_idxs(model.camera(c).model)) for c in set(cameras)}
-    has_own = (asked and has[c] for asked, c in zip(known.tolist(), cameras, strict=True))
-    return MeasuredOwn.of(records, has_own)
+    model, rows = facts.model, images[known]
+    model_id = model.cameras.model_id[model.images.camera_idx[rows]]
+    free = [each for each in set(model_id.tolist()) if fitted_param_idxs(BY_ID[each])]
+    has_own = known.copy()
+    has_own[known] = np.isin(model_id, free)
+    return MeasuredOwn.of(records, has_own.tolist())
 
 
 def _camera(

@@ -11,16 +11,17 @@ import numpy as np
 from sfm_audit.audit.decision.columns import cause_columns
 from sfm_audit.audit.engine.camera import CameraAudit
 from sfm_audit.audit.engine.image_table import OWN_COLUMNS, own_numbers
-from sfm_audit.audit.engine.jointly import below_diagonal
+from sfm_audit.audit.engine.jointly import below_diagonal_of
 from sfm_audit.audit.engine.known import ModelFacts
 from sfm_audit.audit.inliers.stored_errors import StoredErrors
 from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.audit.table.arrow import Coded, Column
+from sfm_audit.audit.table.arrow import Coded, Column, Listed
 from sfm_audit.audit.table.columns import IMPLIED
 from sfm_audit.audit.table.witnesses import Witness
+from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, SparseModel
 
 Row = dict[str, object]
@@ -78,12 +79,21 @@ def camera_columns(facts: ModelFacts, audits: Sequence[CameraAudit], labels: Mod
         "advised_camera_model": [audit.advised_camera_model for audit in audits],
         **dict(zip(OWN_COLUMNS, np.array(own).reshape(-1, len(OWN_COLUMNS)).T, strict=True)),
         "own_parameters": [list(step.names) if step else None for step in steps],
-        "own_correlations": [below_diagonal(step.correlation) if step else None for step in steps],
+        "own_correlations": _correlations([None if step is None else step.correlation for step in steps]),
         **{name: [each.get(name, math.nan) for each in freed] for name in (*IMPLIED, *(f"{n}_sd" for n in IMPLIED))},
         "sd_focal_rel_joint": [step.sd_focal_rel if step else math.nan for step in steps],
         "joint_blocks": [joint.num_blocks if joint else None] * len(audits),
         "misfit_material": np.array([bool(audit.misfit.material) for audit in audits], dtype=bool),
     }
+
+
+def _correlations(matrices: Sequence[FloatArray | None]) -> Listed:
+    """The values below the diagonal of each matrix; null where they are not known."""
+    values = [np.empty(0) if each is None else each[below_diagonal_of(len(each))] for each in matrices]
+    joined = np.concatenate([np.empty(0), *values])
+    offsets = np.concatenate([[0], np.cumsum([each.size for each in values], dtype=np.int64)])
+    known = np.array([each is not None for each in matrices], dtype=bool)
+    return Listed(offsets, np.ma.masked_array(joined, ~np.isfinite(joined)), known)
 
 
 def model_row(
