@@ -47,6 +47,10 @@ class Layout:
         """(I,) images that take part."""
         return np.asarray(self.camera_idx >= 0)
 
+    def takes_part(self, image_idx: int) -> bool:
+        """Whether an image does, without a look at all the others."""
+        return bool(self.camera_idx[image_idx] >= 0)
+
     def own_of_camera(self, camera_idx: int) -> IntArray:
         """Columns of a camera's own parameters."""
         return np.asarray(self.own_columns[camera_idx] + np.arange(len(self.own_param_idxs[camera_idx])))

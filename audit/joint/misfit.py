@@ -239,19 +239,15 @@ class _Rounds:
         return out
 
     def _result(self, most: bool) -> JointMisfit:
-        tests: list[JointTests] = []
-        causes: list[MisfitGroup | None] = []
-        untested: dict[MisfitStatus, JointTests] = {}  # of a large model's blocks nearly all images are
-        for image, is_tested in enumerate(self._tested.tolist()):
-            if is_tested:
-                tests.append(self._joint_tests(image))
-                causes.append(self._cause(image, tests[-1]))
-                continue
-            status = self.tests[image][GROUPS[0]].status
-            if status not in untested:
-                untested[status] = self._joint_tests(image)
-            tests.append(untested[status])
-            causes.append(None)
+        place: dict[int, int] = {}  # of a large model's blocks nearly all images are untested, and share their tests
+        for image, own in enumerate(self.tests):
+            place.setdefault(id(own), image)
+        told = {key: self._joint_tests(image) for key, image in place.items() if not self._tested[image]}
+        tests = [told.get(id(own), {}) for own in self.tests]
+        causes: list[MisfitGroup | None] = [None] * len(tests)
+        for image in np.flatnonzero(self._tested).tolist():
+            tests[image] = self._joint_tests(image)
+            causes[image] = self._cause(image, tests[image])
         effect = np.where(self._tested, self._effects(), np.nan)
         return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
 

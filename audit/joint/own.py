@@ -94,7 +94,7 @@ def own_parameters(
     known = {} if image_covariances is None else image_covariances
     covariances: dict[int, FloatArray] = {}
     for image, covariance in known.items():
-        if layout.has_columns[image]:
+        if layout.takes_part(image):
             covariances[int(layout.camera_idx[image])] = covariance[NUM_POSE:, NUM_POSE:]
     missing = [camera for camera in cameras if camera not in covariances]
     found = system.covariances([layout.own_of_camera(camera) for camera in missing])
@@ -212,7 +212,7 @@ def image_gains(system: JointSystem, image_idx: int) -> Gains:
     everything alone, and next to nothing beside a pose that makes up for it.
     """
     layout = system.observations.layout
-    if not layout.has_columns[image_idx]:
+    if not layout.takes_part(image_idx):
         return Gains(math.nan, math.nan, math.nan)
     columns = layout.columns[image_idx]
     columns = columns[columns < layout.num_columns]

@@ -107,7 +107,7 @@ class JointSystem:
         columns = [layout.columns[i][layout.columns[i] < layout.num_columns] for i in image_idxs]
         out = []
         for image, covariance in zip(image_idxs, self.covariances(columns), strict=True):
-            if not layout.has_columns[image]:
+            if not layout.takes_part(image):
                 out.append(np.full((layout.width, layout.width), np.nan))
                 continue
             transform = np.eye(len(covariance))
