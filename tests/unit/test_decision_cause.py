@@ -8,7 +8,8 @@ from dataclasses import replace
 from decision_samples import ABSORBED, CAMERA, NOT_TESTED, group, sound, with_misfit
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.decide import decide, decide_all
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.decision.misfit import is_worth_nothing
 from sfm_audit.audit.table.words import Member, MisfitGroup, Verdict
 
@@ -47,6 +48,8 @@ def test_no_significant_group_has_no_cause():
     assert decision.misfit.tau_px == 0.2
     assert decision.misfit.untested == ((G.SMOOTH, NOT_TESTED.status),)
     assert (decision.misfit.material, decision.misfit.also) == ((), ())
+    both = decide_all(Measured.of([with_misfit(smooth=NOT_TESTED), with_misfit(radial=group(q=0.01))]), AuditConfig())
+    assert both.misfit.cause.tolist() == [-1, 0]  # what tables take for no cause
 
 
 def test_only_a_tested_group_can_be_the_cause():
