@@ -95,6 +95,7 @@ def test_the_worth_is_that_of_the_named_cause():
     assert np.isnan(decisions.misfit.worth[1:]).all()
     assert decisions.decision(0).severity is WEAK
     assert [decisions.decision(i).severity for i in (1, 2)] == [None, None]
+    assert decisions.severity.tolist() == [SEVERITIES.index(WEAK), -1, -1]  # -1 is null in tables
 
 
 def test_hard_is_listed_first():
