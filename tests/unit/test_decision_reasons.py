@@ -28,8 +28,9 @@ from decision_samples import (
 )
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.decide import decide, decide_all
 from sfm_audit.audit.decision.diagnostics import Gains, SharedMisfit
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.table.words import (
     GROUPS,
     MISFIT_CODES,
@@ -367,3 +368,15 @@ def test_every_reason_has_words():
 )
 def test_remarks_decide_nothing(code, verdict_misfit, remark):
     assert is_remark(code, {M.MISFIT: verdict_misfit}) is remark
+
+
+def test_each_of_many_images_is_told_its_own_numbers():
+    images = [noise(num_inliers=n, num_standardised=m) for n, m in ((300, 3), (200, 3), (300, 4), (300, 3))]
+    decisions = decide_all(Measured.of(images), AuditConfig())
+    texts = [decisions.decision(i).members[M.KS].reasons[0].text for i in range(4)]
+    assert [text.partition(",")[0] for text in texts] == [
+        "3 standardised of 300 inliers",
+        "3 standardised of 200 inliers",
+        "4 standardised of 300 inliers",
+        "3 standardised of 300 inliers",
+    ]

@@ -81,6 +81,7 @@ TABLE = [
         for m in ASKS_FOR_MEASUREMENTS
     ),
     *((m, sound(largest_residual_px=1.001 * EXACT_PX), {}, ACCEPTED, []) for m in ASKS_FOR_MEASUREMENTS),
+    (M.MISFIT, sound(largest_residual_px=0.0, num_inliers=1), {}, UNDETERMINED, [C.EXACT_PROJECTIONS]),
     *((m, sound(largest_residual_px=NAN), {}, ACCEPTED, []) for m in ASKS_FOR_MEASUREMENTS),
     # verdict_ks
     (M.KS, noise(ks_p=0.05), {}, ACCEPTED, []),
