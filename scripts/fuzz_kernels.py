@@ -123,6 +123,7 @@ def audit_everything(rng: np.random.Generator, *, quick: bool) -> None:
                 _audit(models.writer.write_binary(place / f"{k}{shared}", model))
         shared_model = models.lens_model(models.LENSES[2], rng, (120, 90, 70), shared=True)
         _audit(models.writer.write_binary(place / "shared", shared_model))
+        _audit(models.writer.write_binary(place / "strip", models.strip_model(models.LENSES[2], rng, 40)))
         large = 40_000 if quick else 1_000_000
         _audit(
             models.writer.write_binary(

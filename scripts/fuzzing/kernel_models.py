@@ -33,6 +33,29 @@ def params_of(lens: CameraModel, rng: np.random.Generator) -> tuple[float, ...]:
     return tuple(map(float, params))
 
 
+def strip_model(lens: CameraModel, rng: np.random.Generator, num_images: int) -> Any:
+    """Return a model whose images see what their neighbours see: the joint system couples within a band."""
+    step, seen_by_each = 40, 120
+    xyz = rng.uniform((-2.0, -1.5, 5.0), (2.0, 1.5, 7.0), (step * (num_images - 1) + seen_by_each, 3))
+    params = params_of(lens, rng)
+    images, tracks = [], [list[tuple[int, int]]() for _ in xyz]
+    for k in range(num_images):
+        seen = np.arange(step * k, step * k + seen_by_each)
+        centre = np.array([0.3 * (k % 5) - 0.6, 0.1 * (k % 3), 0.0])
+        xy = project(lens, np.array(params), xyz[seen] - centre) + rng.normal(0.0, 0.5, (seen_by_each, 2))
+        points2d = tuple((float(x), float(y), int(p) + 1) for (x, y), p in zip(xy, seen, strict=True))
+        for row, point in enumerate(seen.tolist()):
+            tracks[point].append((k + 1, row))
+        pose = (1.0, 0.0, 0.0, 0.0, *map(float, -centre))
+        images.append(writer.Image(k + 1, f"{k}.jpg", points2d, pose, k + 1))
+    cameras = [writer.Camera(k + 1, lens.model_id, *_SIZE, params) for k in range(num_images)]
+    points = [
+        writer.Point(k + 1, tuple(track), tuple(map(float, at)), 0.5)
+        for k, (track, at) in enumerate(zip(tracks, xyz, strict=True))
+    ]
+    return writer.Model(tuple(cameras), tuple(images), tuple(points))
+
+
 def lens_model(lens: CameraModel, rng: np.random.Generator, numbers: Sequence[int], *, shared: bool) -> Any:
     """Return a model whose images see so many points each, by a shared camera or their own, with noise of 0.5 px."""
     num_points = max(numbers)
