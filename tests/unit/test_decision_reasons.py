@@ -380,3 +380,11 @@ def test_each_of_many_images_is_told_its_own_numbers():
         "4 standardised of 300 inliers",
         "3 standardised of 300 inliers",
     ]
+
+
+def test_an_image_that_cannot_be_asked_takes_no_words_from_others():
+    odd = Reason(C.MISSING_CAMERA, M.MISFIT, "camera 3")
+    decisions = decide_all(Measured.of([replace(noise(ks_p=0.01), unusable=odd), noise(ks_p=0.02)]), AuditConfig())
+    assert {reason.code for reason in decisions.decision(0).all_reasons} == {C.MISSING_CAMERA}
+    (reason,) = decisions.decision(1).members[M.KS].reasons
+    assert (reason.value, reason.text.partition(" <")[0]) == (0.02, "p = 0.02")
