@@ -56,7 +56,23 @@ def call_pair_sums(rng: np.random.Generator) -> None:
         witnesses.pair_sums((num_points, num_images), point, image, sees, views)
 
 
-CALLS: Final[dict[str, Callable[[np.random.Generator], None]]] = {"witness_pair_sums": call_pair_sums}
+def call_near_entries(rng: np.random.Generator) -> None:
+    """Entries of a band; the models here are too small to have one."""
+    from sfm_audit.audit.kernels.joint_parts import near_entries  # noqa: PLC0415 - in the child only
+
+    for _ in range(20):
+        width, size = int(rng.integers(1, 9)), int(rng.integers(1, 60))
+        first = np.arange(0, size, width)
+        rows, columns = np.minimum(width, size - first), np.minimum(4 * width, size - first)
+        starts = np.concatenate([[0], np.cumsum(rows * columns)]).astype(np.int64)
+        place = np.sort(rng.choice(size, int(rng.integers(0, size + 1)), replace=False)).astype(np.int64)
+        near_entries(place, width, rng.normal(size=int(starts[-1])), starts, columns.astype(np.int64))
+
+
+CALLS: Final[dict[str, Callable[[np.random.Generator], None]]] = {
+    "joint_near_entries": call_near_entries,
+    "witness_pair_sums": call_pair_sums,
+}
 """By name: calls of a kernel's Python module with random arguments, for kernels that no audit here calls."""
 
 TRUSTED: Final[dict[str, frozenset[int]]] = {
