@@ -24,6 +24,7 @@ from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 _X, _Y, _BOTH = 0, SCALAR, 2 * SCALAR  # where functions along x, along y and with both components begin
 _ROLLING, _NEXT = _BOTH + 4, _BOTH + 10
+_LEFT_OF_TERMS: Final = 1e-4  # share of its functions' squared lengths that a field has at least: four digits may go
 _MISSING: Final = 6
 """Columns of the parameters that a camera may lack, behind the candidate fields: see `implied`."""
 
@@ -63,11 +64,16 @@ def image_scores(
     solution = base.inverse.within(placed.support, right)
     sums.second(half, tracks, placed.spread(solution))
     made_of = _fields(camera, _world_from_cam(base, image, image_idx), power)
-    gram = half.gram - right.T @ solution
-    with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = half.gram - right.T @ solution
         meat = half.track_score.T @ half.track_score
+        if not (np.isfinite(gram).all() and np.isfinite(meat).all()):
+            return None  # numpy keeps what is not finite to the fields that it belongs to
+        squares = _squares(half)
+        sq_length = ((squares @ made_of) * made_of).sum(axis=0)
+        if not (sq_length >= _LEFT_OF_TERMS * (squares.diagonal() @ made_of**2)).all():
+            return None  # functions that all but cancel, of an image that is a dot in the middle of nowhere
         gram, meat = (made_of.T @ each @ made_of for each in (0.5 * (gram + gram.T), meat))
-        sq_length = ((_squares(half) @ made_of) * made_of).sum(axis=0)
     score = half.score @ made_of
     of_fields = sq_length, gram, score, meat, tracks[1]
     return CandidateScores(*of_fields, right, placed.support, solution, observations.num_of(image_idx), made_of)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,9 @@ class Worth(NamedTuple):
     focal_rel: float
 
 
+_AS_LARGE: Final = (
+    1.0 - 1e-6
+)  # of two focal lengths that change alike, in opposite directions, the first one is told of
 NO_WORTH = Worth(math.nan, math.nan, math.nan)
 
 
@@ -62,4 +65,5 @@ def _focal_change(system: JointSystem, image_idx: int, change: FloatArray) -> fl
     camera = system.model.camera(camera_idx)
     own = system.observations.layout.own_param_idxs[camera_idx]
     relative = [float(change[own.index(i)] / camera.params[i]) for i in camera.model.focal_idxs]
-    return max(relative, key=abs, default=math.nan)
+    largest = max(map(abs, relative), default=math.nan)
+    return next((change for change in relative if abs(change) >= _AS_LARGE * largest), math.nan)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, projector, solved, stacked, system_of, with_param, with_poses
 from numpy.testing import assert_allclose
-from scipy import stats
+from scipy import sparse, stats
 from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.engine.model import ModelAuditor
@@ -188,6 +188,16 @@ def test_the_test_is_hotelling_s(system):
     scores = dataclasses.replace(scores, score=3.0 * scores.score)
     assert judge_group(scores, columns, root, sigma_px=0.7, rms_px=1.0).status is MisfitStatus.TESTED
     assert judge_group(scores, columns, root, sigma_px=0.7, rms_px=1e-3).status is MisfitStatus.NOT_ESTIMABLE
+
+
+@pytest.mark.parametrize(("share", "is_lost"), [(1e-9, True), (1e-2, False)])
+def test_what_rounding_makes_of_an_eigenvalue_identifies_nothing(share, is_lost):
+    """A column of which the elimination of points leaves little: an eigenvalue of 1e-8 is rounding of it."""
+    matrix = np.array([[1.0, 1.0 - 1e-8], [1.0 - 1e-8, 1.0]])
+    before = np.full(2, 1.0 / share)
+    inverse = joint_inverse(sparse.csr_array(matrix), before, np.zeros((2, 0)))
+    assert inverse.unidentified.tolist() == [is_lost] * 2
+    assert inverse.num_null == int(is_lost)
 
 
 def test_inclusion_is_the_same_as_columns_more(system, reference):

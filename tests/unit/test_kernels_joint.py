@@ -161,6 +161,15 @@ def test_an_image_has_the_same_scores(both):
             same_scores(found.only(columns), expected.only(columns))
 
 
+def test_an_image_with_fields_that_are_not_finite_is_left_to_numpy(both):
+    """A rolling shutter over no rows: the other groups are tested all the same."""
+    if both.name != "SIMPLE_RADIAL":
+        return
+    cameras = dataclasses.replace(both.model.cameras, height=np.zeros_like(both.model.cameras.height))
+    flat = dataclasses.replace(both.plain, model=dataclasses.replace(both.model, cameras=cameras))
+    assert image_scores(flat, both.plain.base, sums_of_base(both.plain.base), 0, 0) is None
+
+
 def test_beside_included_fields_too(both):
     if both.name == "FULL_OPENCV":
         return

@@ -612,6 +612,7 @@ WIDE KERNEL int64_t joint_fields(
     int64_t power, double *scalar, double *dense) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
     const double *r = facts, *t = facts + 9;
+    double all = 0.0; /* of everything: NaN or infinite where a field is */
     double fx = facts[12], fy = facts[13], middle_x = facts[14], middle_y = facts[15], half = facts[16], height = facts[17];
     for (int64_t i = 0; i < n; i++) {
         const double *p = xyz + 3 * i, *dx = m->design + (first + i) * 2 * m->width, *dy = dx + m->width;
@@ -638,6 +639,8 @@ WIDE KERNEL int64_t joint_fields(
         d[2] = fx * cross, e[2] = fy * (r2 + 2.0 * v * v), d[3] = fx * (r2 + 2.0 * u * u), e[3] = fy * cross;
         for (int c = 0; c < 6; c++) d[4 + c] = dx[c] * along, e[4 + c] = dy[c] * along;
         d[10] = sx * next, e[10] = sy * next, d[11] = 0.0, e[11] = 0.0;
+        for (int c = 0; c < 2 * DENSE; c++) all += d[c];
+        all += f[10] + f[14];
     }
-    return DONE;
+    return all - all == 0.0 ? DONE : NEEDS_NUMPY;
 }

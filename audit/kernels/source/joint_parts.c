@@ -32,14 +32,16 @@ KERNEL int64_t joint_invert(int64_t num_points, double *matrices, double *determ
         for (int i = 0; i < 3; i++) s[i] = sqrt(v[4 * i] > smallest ? v[4 * i] : smallest);
         double a = v[0] / s[0] / s[0], b = v[1] / s[0] / s[1], c = v[2] / s[0] / s[2];
         double d = v[4] / s[1] / s[1], e = v[5] / s[1] / s[2], f = v[8] / s[2] / s[2];
-        double co00 = d * f - e * e, co01 = c * e - b * f, co02 = b * e - c * d;
-        double det = a * co00 + b * co01 + c * co02;
-        determinant[p] = det;
-        if (!invert || (v[0] == 0.0 && v[4] == 0.0 && v[8] == 0.0)) continue;
-        double co11 = a * f - c * c, co12 = b * c - a * e, co22 = a * d - b * b, scale = 1.0 / det;
-        v[0] = co00 * scale / s[0] / s[0], v[1] = v[3] = co01 * scale / s[0] / s[1];
-        v[2] = v[6] = co02 * scale / s[0] / s[2], v[4] = co11 * scale / s[1] / s[1];
-        v[5] = v[7] = co12 * scale / s[1] / s[2], v[8] = co22 * scale / s[2] / s[2];
+        /* L D L^T: as many digits as V has, where cofactors would lose those of the determinant */
+        double l10 = b / a, l20 = c / a, d1 = d - l10 * b, t = e - l10 * c, l21 = t / d1, d2 = f - l20 * c - l21 * t;
+        int is_empty = v[0] == 0.0 && v[4] == 0.0 && v[8] == 0.0;
+        determinant[p] = is_empty ? 0.0 : a * d1 * d2;
+        if (!invert || is_empty) continue;
+        double m20 = l10 * l21 - l20; /* below the diagonal of L^-1: -l10; m20, -l21 */
+        double x22 = 1.0 / d2, x12 = -l21 * x22, x02 = m20 * x22;
+        double x11 = 1.0 / d1 - l21 * x12, x01 = -l10 / d1 - l21 * x02, x00 = 1.0 / a + l10 * (l10 / d1) + m20 * x02;
+        v[0] = x00 / s[0] / s[0], v[1] = v[3] = x01 / s[0] / s[1], v[2] = v[6] = x02 / s[0] / s[2];
+        v[4] = x11 / s[1] / s[1], v[5] = v[7] = x12 / s[1] / s[2], v[8] = x22 / s[2] / s[2];
     }
     return DONE;
 }
