@@ -63,7 +63,7 @@ def image_scores(
     right = placed.collected(half.right)
     solution = base.inverse.within(placed.support, right)
     sums.second(half, tracks, placed.spread(solution))
-    made_of = _fields(camera, _world_from_cam(base, image, image_idx), power)
+    made_of = _fields(camera, power)
     with np.errstate(over="ignore", invalid="ignore"):
         gram = half.gram - right.T @ solution
         meat = half.track_score.T @ half.track_score
@@ -80,14 +80,16 @@ def image_scores(
 
 
 def _inputs(system: JointSystem, image_idx: int, camera: CameraRecord) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Facts (18,) of `JointSums.fields`, xyz_world (n, 3), predicted xy_px (n, 2)."""
+    """Facts (27,) of `JointSums.fields`, xyz_world (n, 3), predicted xy_px (n, 2)."""
     observations, residuals = system.observations, system.residuals
     source = observations.source[observations.rows(image_idx)]
     image = system.model.image(image_idx)
     focals = camera.params[list(camera.model.focal_idxs)]
     width, height = camera.width, camera.height
     size = [focals[0], focals[-1], 0.5 * width, 0.5 * height, 0.5 * max(width, height), height]
-    facts = np.concatenate([image.rotation_cam_from_world.ravel(), image.translation_cam_from_world, size])
+    inverse = _world_from_cam(system.base, image, image_idx)
+    pose = image.rotation_cam_from_world.ravel(), image.translation_cam_from_world
+    facts = np.concatenate([*pose, size, inverse.ravel()])
     xyz_world = system.model.points.xyz_world.take(residuals.point_idx[source], axis=0)
     observed = system.model.observations.xy_px.take(residuals.observation_row[source], axis=0)
     return facts, xyz_world, observed - residuals.residuals_px.take(source, axis=1).T
@@ -101,11 +103,8 @@ def _world_from_cam(base: Base, image: ImageRecord, image_idx: int) -> FloatArra
     return np.asarray(np.linalg.pinv(image.rotation_cam_from_world))
 
 
-def _fields(camera: CameraRecord, world_from_cam: FloatArray, power: int) -> FloatArray:
-    """(44, c) of which functions the candidate fields are made, then the missing parameters'.
-
-    ``world_from_cam`` (3, 3): the sums have the derivatives in a translation along the world's axes.
-    """
+def _fields(camera: CameraRecord, power: int) -> FloatArray:
+    """(44, c) of which functions the candidate fields are made, then the missing parameters'."""
     out = np.zeros((FIELDS, NUM_FIELDS + (_MISSING if power else 0)))
     focals, centre = camera.model.focal_idxs, camera.model.principal_point_idxs
     fx, fy = camera.params[focals[0]], camera.params[focals[-1]]
@@ -124,8 +123,7 @@ def _fields(camera: CameraRecord, world_from_cam: FloatArray, power: int) -> Flo
     out[[_X, _X + 1], affine] = 0.5 * camera.width - cx, half  # fx v_x = x - cx
     out[[_X, _X + 2], affine + 1] = fx / fy * (0.5 * camera.height - cy), fx / fy * half
     out[_X, shift], out[_Y, shift + 1] = fx, fy
-    out[_ROLLING : _ROLLING + 3, rolling : rolling + 3] = np.eye(3)
-    out[_ROLLING + 3 : _ROLLING + 6, rolling + 3 : rolling + 6] = world_from_cam
+    out[_ROLLING : _ROLLING + 6, rolling : rolling + 6] = np.eye(6)
     for k in range(SCALAR - 2):
         out[_X + 1 + k, smooth + k] = 1.0
         out[_Y + 1 + k, smooth + SCALAR - 2 + k] = 1.0

@@ -271,8 +271,8 @@ def _orthonormal(gauge: FloatArray, scale: FloatArray, dead: BoolArray, matrix: 
 def _null_directions(factor: BandedFactor | _DenseFactor, rounding: FloatArray) -> FloatArray:
     """(D, k) orthonormal directions with an eigenvalue below the threshold, by block inverse iteration.
 
-    ``rounding`` (D,): square root of the diagonal of B over that of S. What is left of B has rounding in its digits: along
-    a direction v they add up to some eps (sum |v| rounding)^2, and an eigenvalue below that says nothing.
+    ``rounding`` (D,): root of the diagonal of B over that of S. What is left of B has rounding in its digits: along a
+    direction v these add up to some eps (sum |v| rounding)^2, and an eigenvalue below that says nothing.
     """
     rng, size = np.random.default_rng(0), len(rounding)
     count = min(8, size)

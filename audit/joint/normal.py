@@ -66,25 +66,27 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
 def _compiled_systems(
     observations: JointObservations, sums: JointSums, inverses: list[FloatArray], values_px: FloatArray
 ) -> tuple[ReducedSystem, ReducedSystem] | None:
-    """The same by the compiled sums, which are without T: it comes to them here, all images at once."""
+    """The same by the compiled sums; the others' side of a block is without T, which comes to all of them here."""
     layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
     cleaned = sums.off_points(values_px, 0)[1], sums.off_points(values_px, 1)[1]
-    found = [each for image in images.tolist() if (each := sums.normal(image, cleaned)) is not None]
+    found = [
+        each
+        for image in images.tolist()
+        if (each := sums.normal(image, observations.transform[image], cleaned)) is not None
+    ]
     if not found or len(found) < images.size:
         return None
     pairs = np.repeat(np.arange(images.size), [each.around.size for each in found])
     around = np.concatenate([each.around for each in found])
-    own_transform = observations.transform[images]
     own_columns = layout.columns[images]
     systems = []
     for k, inverse in enumerate(inverses):
-        gram = own_transform.transpose(0, 2, 1) @ np.stack([each.grams[k] for each in found]) @ own_transform
-        score = np.einsum("iab,ia->ib", own_transform, np.stack([each.rights[k] for each in found]))
+        gram, score = np.stack([each.grams[k] for each in found]), np.stack([each.rights[k] for each in found])
         right, before = np.zeros((2, layout.num_columns + 1))
         np.add.at(right, own_columns, score)
         np.add.at(before, own_columns, np.einsum("iaa->ia", gram))
         slabs = np.concatenate([each.slabs[k] for each in found])
-        slabs = observations.transform[around].transpose(0, 2, 1) @ slabs @ own_transform[pairs]
+        slabs = observations.transform[around].transpose(0, 2, 1) @ slabs
         first = np.flatnonzero(np.diff(pairs, prepend=-1))
         slabs[first] += 0.5 * gram
         matrix = _symmetric(layout.num_columns, layout.columns[around], own_columns[pairs], slabs)
@@ -175,12 +177,12 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
 
 def _compiled_meat(observations: JointObservations, sums: JointSums) -> sparse.csr_array | None:
     layout, transform, images = observations.layout, observations.transform, observations.used_images
-    found = [each for image in images if (each := sums.meat(image)) is not None]
+    found = [each for image in images if (each := sums.meat(image, transform[image])) is not None]
     if not found or len(found) < len(images):
         return None
     own = np.repeat(images, [around.size for around, _ in found]).astype(np.int64)
     around = np.concatenate([around for around, _ in found])
-    slabs = transform[around].transpose(0, 2, 1) @ np.concatenate([slab for _, slab in found]) @ transform[own]
+    slabs = transform[around].transpose(0, 2, 1) @ np.concatenate([slab for _, slab in found])
     return _symmetric(layout.num_columns, layout.columns[around], layout.columns[own], slabs)
 
 

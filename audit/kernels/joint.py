@@ -81,8 +81,8 @@ class _Space(NamedTuple):
 class NormalOfImage(NamedTuple):
     """What an image adds to the normal equations.
 
-    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows)
-    and the image (columns), its own one halved.    grams: (2, C, C).    rights: (2, C). All without T.
+    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows,
+    without T) and the image (columns, with T), its own one halved.    grams: (2, C, C), rights: (2, C), with T.
     """
 
     around: IntArray
@@ -184,12 +184,12 @@ class JointSums:
 
         Parameters
         ----------
-        facts : (18,) R, t of cam_from_world, fx, fy, half width, half height, half of the larger one, height
+        facts : (27,) R, t of cam_from_world, fx, fy, half width, half height, half of the larger one, height, R^-1
         xyz_world, xy_px : (n_i, 3) and (n_i, 2) predicted        power : of r^2 in the next radial term, 0 for none
         """
         function = kernel("joint_fields", _ModelPointer, Size, Doubles, Doubles, Doubles, Size, Size, Doubles, Doubles)
         n = self._num_rows(image_idx)
-        if function is None or xyz_world.shape != (n, 3) or xy_px.shape != (n, 2) or facts.shape != (18,):
+        if function is None or xyz_world.shape != (n, 3) or xy_px.shape != (n, 2) or facts.shape != (27,):
             return None
         scalar, dense = np.empty((n, SCALAR)), np.empty((n, 2, DENSE))
         status = function(
@@ -265,58 +265,45 @@ class JointSums:
         arguments = (own, first.around, start, tracks[0], scores, np.ascontiguousarray(moved), first.track_score)
         function(ctypes.byref(self._model), len(first.around), *arguments)
 
-    def normal(self, image_idx: int, cleaned: tuple[FloatArray, FloatArray]) -> NormalOfImage | None:
-        """What an image adds to the normal equations; ``cleaned`` (n, 2): residuals off the points, of both systems."""
+    def normal(
+        self, image_idx: int, transform: FloatArray, cleaned: tuple[FloatArray, FloatArray]
+    ) -> NormalOfImage | None:
+        """What an image adds to the normal equations.
+
+        Parameters
+        ----------
+        transform : (C, C) T of the image        cleaned : (n, 2) residuals off the points, of both systems
+        """
         function = kernel(
-            "joint_normal",
-            *(_ModelPointer, Ints, Size, Size, Doubles, Doubles, Ints, Ints, Doubles, Doubles, Doubles, Doubles),
+            "joint_normal", _ModelPointer, Ints, Size, Size, *([Doubles] * 3), Ints, Ints, *([Doubles] * 4)
         )
-        views = int(self._num_views[image_idx])
+        views, width = int(self._num_views[image_idx]), self.width
         if function is None or any(values.shape != self._held["left"].shape for values in cleaned):
             return None
-        most = min(views, self._num_images)
+        most, place = min(views, self._num_images), np.zeros(self._num_images, dtype=np.int64)
         around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
-        slab, other = np.empty((2, most, self.width, self.width))
-        grams, rights = np.empty((2, self.width, self.width)), np.empty((2, self.width))
-        status = function(
-            ctypes.byref(self._model),
-            np.zeros(self._num_images, dtype=np.int64),
-            image_idx,
-            views,
-            *cleaned,
-            around,
-            num,
-            slab,
-            other,
-            grams,
-            rights,
-        )
+        slabs, grams, rights = np.empty((2, most, width, width)), np.empty((2, width, width)), np.empty((2, width))
+        given = doubles(transform, (width, width)), *cleaned
+        found = around, num, slabs[0], slabs[1], grams, rights
+        status = function(ctypes.byref(self._model), place, image_idx, views, *given, *found)
         if status != DONE:
             return None
-        count = int(num[0])
-        return NormalOfImage(around[:count], np.stack([slab[:count], other[:count]]), grams, rights)
+        return NormalOfImage(around[: int(num[0])], slabs[:, : int(num[0])], grams, rights)
 
-    def meat(self, image_idx: int) -> tuple[IntArray, FloatArray] | None:
-        """(m,) the image and those behind it that see its points; (m, C, C) scores times its own, summed, without T."""
-        function = kernel("joint_meat", _ModelPointer, Ints, Size, Size, SmallInts, Size, Ints, Ints, Doubles)
+    def meat(self, image_idx: int, transform: FloatArray) -> tuple[IntArray, FloatArray] | None:
+        """(m,) the image and those behind it that see its points; (m, C, C) scores times its own, summed.
+
+        ``transform`` (C, C): T of the image; its own scores are with it, those of the others without theirs.
+        """
+        function = kernel("joint_meat", _ModelPointer, Ints, Size, Size, Doubles, SmallInts, Size, Ints, Ints, Doubles)
         if function is None:
             return None
-        views = int(self._num_views[image_idx])
-        most = min(views, self._num_images)
+        views, width = int(self._num_views[image_idx]), self.width
+        most, place = min(views, self._num_images), np.zeros(self._num_images, dtype=np.int64)
         around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
-        slab = np.empty((most, self.width, self.width))
-        track, num_tracks = self.tracks(image_idx)
-        status = function(
-            ctypes.byref(self._model),
-            np.zeros(self._num_images, dtype=np.int64),
-            image_idx,
-            views,
-            track,
-            num_tracks,
-            around,
-            num,
-            slab,
-        )
+        slab = np.empty((most, width, width))
+        given = doubles(transform, (width, width)), *self.tracks(image_idx)
+        status = function(ctypes.byref(self._model), place, image_idx, views, *given, around, num, slab)
         return (around[: int(num[0])], slab[: int(num[0])]) if status == DONE else None
 
     def off_points(

@@ -276,8 +276,8 @@ def test_extreme_numbers_come_through_as_numbers(value):
     assert half.track_score.shape == (3, 44)
     steps, cleaned = sums.off_points(arrays.left_px)
     assert (steps.shape, cleaned.shape) == ((3, 3), (6, 2))
-    assert sums.normal(1, (cleaned, cleaned)).around.tolist() == [1]
-    assert sums.meat(0)[1].shape == (2, 8, 8)
+    assert sums.normal(1, np.eye(8), (cleaned, cleaned)).around.tolist() == [1]
+    assert sums.meat(0, np.eye(8))[1].shape == (2, 8, 8)
 
 
 def test_an_image_without_observations_has_nothing_around():

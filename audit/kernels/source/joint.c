@@ -395,8 +395,8 @@ WIDE KERNEL int64_t joint_second(
 
 /* One pair of systems: the robust weights and those of the second system. `padded` is the width, rounded up to LANES.
  *
- * slab, other_slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows), W from
- * the design without T. */
+ * slab, other_slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the
+ * design without T). */
 static inline __attribute__((always_inline)) void add_slab(
     const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
     const double *other_absorbed, double *slab, double *other_slab) {
@@ -427,14 +427,30 @@ static inline __attribute__((always_inline)) void add_slab(
     }
 }
 
-/* V^-1 W^T (3, padded) of a row. */
+/* N (n, 2, width) = design T of an image's rows. T comes first: products of columns that all but cancel in it (the depth of what a
+ * long lens sees) would lose twice the digits. */
+static void take_nuisance(const joint_model *m, int64_t first, int64_t n, const double *transform, double *out) {
+    int64_t width = m->width;
+    for (int64_t row = 0; row < 2 * n; row++) {
+        const double *from = m->design + (2 * first + row) * width;
+        double *to = out + row * width;
+        memset(to, 0, (size_t)width * sizeof *to);
+        for (int64_t c = 0; c < width; c++) {
+            for (int64_t d = 0; d < width; d++) to[d] += from[c] * transform[c * width + d];
+        }
+    }
+}
+
+/* V^-1 W^T (3, padded) of a row; nuisance (2, width): its N. */
 static inline void absorb_row(
-    const joint_model *m, int64_t row, int64_t padded, const double *weight, const double *inverse, double *out) {
-    const double *dx = m->design + row * 2 * m->width, *dy = dx + m->width, *v = inverse + 9 * m->point_idx[row];
+    const joint_model *m, int64_t row, const double *nuisance, int64_t padded, const double *weight, const double *inverse,
+    double *out) {
+    const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width, *v = inverse + 9 * m->point_idx[row];
+    const double *nx = nuisance, *ny = nuisance + m->width;
     for (int i = 0; i < 3; i++) {
-        double x = weight[row] * (v[3 * i] * dx[3] + v[3 * i + 1] * dx[4] + v[3 * i + 2] * dx[5]);
-        double y = weight[row] * (v[3 * i] * dy[3] + v[3 * i + 1] * dy[4] + v[3 * i + 2] * dy[5]);
-        for (int64_t d = 0; d < padded; d++) out[i * padded + d] = d < m->width ? x * dx[d] + y * dy[d] : 0.0;
+        double x = weight[row] * (v[3 * i] * jx[0] + v[3 * i + 1] * jx[1] + v[3 * i + 2] * jx[2]);
+        double y = weight[row] * (v[3 * i] * jy[0] + v[3 * i + 1] * jy[1] + v[3 * i + 2] * jy[2]);
+        for (int64_t d = 0; d < padded; d++) out[i * padded + d] = d < m->width ? x * nx[d] + y * ny[d] : 0.0;
     }
 }
 
@@ -445,29 +461,29 @@ static void trim(const double *from, int64_t padded, int64_t width, double scale
     }
 }
 
-/* gram (width, width) += design^T w design, right (width) += design^T w cleaned, of an image's own rows. */
+/* gram (width, width) = N^T w N, right (width) = N^T w cleaned, of an image's own rows. */
 static inline __attribute__((always_inline)) void add_own(
-    const joint_model *m, int64_t width, int64_t first, int64_t last, const double *weight, const double *cleaned,
-    double *gram, double *right) {
+    int64_t width, int64_t first, int64_t n, const double *nuisance, const double *weight, const double *cleaned, double *gram,
+    double *right) {
     memset(gram, 0, (size_t)(width * width) * sizeof *gram);
     memset(right, 0, (size_t)width * sizeof *right);
-    for (int64_t row = first; row < last; row++) {
-        const double *dx = m->design + row * 2 * width, *dy = dx + width;
-        double w = weight[row], x = w * cleaned[2 * row], y = w * cleaned[2 * row + 1];
+    for (int64_t i = 0; i < n; i++) {
+        const double *nx = nuisance + i * 2 * width, *ny = nx + width;
+        double w = weight[first + i], x = w * cleaned[2 * (first + i)], y = w * cleaned[2 * (first + i) + 1];
         for (int64_t c = 0; c < width; c++) {
-            double wx = w * dx[c], wy = w * dy[c];
-            right[c] += dx[c] * x + dy[c] * y;
-            for (int64_t d = 0; d < width; d++) gram[c * width + d] += wx * dx[d] + wy * dy[d];
+            double wx = w * nx[c], wy = w * ny[c];
+            right[c] += nx[c] * x + ny[c] * y;
+            for (int64_t d = 0; d < width; d++) gram[c * width + d] += wx * nx[d] + wy * ny[d];
         }
     }
 }
 
 /* What an image adds to the normal equations without the points, of both systems (reduced_systems of audit/joint/normal.py).
  *
- * cleaned, other_cleaned (n, 2): residuals off the points. eliminate: 0 where points are independent.
+ * transform (width, width): T of the image.    cleaned, other_cleaned (n, 2): residuals off the points.
  * Out: around (m), num (1): m; slabs as add_slab; grams (2, width, width), rights (2, width). */
 WIDE KERNEL int64_t joint_normal(
-    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *cleaned,
+    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *transform, const double *cleaned,
     const double *other_cleaned, int64_t *around, int64_t *num, double *slab, double *other_slab, double *grams,
     double *rights) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
@@ -476,18 +492,21 @@ WIDE KERNEL int64_t joint_normal(
     int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
     int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
     double *absorbed = malloc((size_t)(6 * padded * n + 1) * sizeof *absorbed), *other = absorbed + 3 * padded * n;
-    int64_t status = view && start && own && absorbed ? DONE : NO_MEMORY;
+    double *nuisance = malloc((size_t)(2 * width * n + 1) * sizeof *nuisance);
+    int64_t status = view && start && own && absorbed && nuisance ? DONE : NO_MEMORY;
     if (status == DONE) {
         surroundings near = {view, own, around, start, 0, 0};
         collect(m, first, first + n, image, place, &near);
+        take_nuisance(m, first, n, transform, nuisance);
         for (int64_t i = 0; i < n; i++) {
             if (i + AHEAD < n) {
                 int64_t point = m->point_idx[first + i + AHEAD];
                 SOON(m->point_inverse + 9 * point), SOON(m->point_inverse + 9 * point + 8);
                 SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
             }
-            absorb_row(m, first + i, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
-            absorb_row(m, first + i, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
+            const double *mine = nuisance + 2 * width * i;
+            absorb_row(m, first + i, mine, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
+            absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
         }
         for (int64_t k = 0; k < near.num_images; k++) {
             double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
@@ -502,29 +521,32 @@ WIDE KERNEL int64_t joint_normal(
         for (int which = 0; which < 2; which++) {
             const double *weight = which ? m->other_weight : m->weight, *values = which ? other_cleaned : cleaned;
             double *gram = grams + which * width * width, *right = rights + which * width;
-            if (width == 8) add_own(m, 8, first, first + n, weight, values, gram, right);
-            else add_own(m, width, first, first + n, weight, values, gram, right);
+            if (width == 8) add_own(8, first, n, nuisance, weight, values, gram, right);
+            else add_own(width, first, n, nuisance, weight, values, gram, right);
         }
     }
-    free(view), free(start), free(own), free(absorbed);
+    free(view), free(start), free(own), free(absorbed), free(nuisance);
     return status;
 }
 
-/* slab (m, width, width): sum over tracks of s_k s^T, s the sum of w design^T y~ over an image's views of a track, between an
- * image (columns) and everybody behind it (rows); its own one is halved (score_meat). track: as in joint_first. */
+/* slab (m, width, width): sum over tracks of s_k s^T, s the sum of w y~ over an image's views of a track times N for the image
+ * (columns), times the design without T for everybody behind it (rows); its own one is halved (score_meat). track: as in
+ * joint_first. */
 WIDE KERNEL int64_t joint_meat(
-    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const int32_t *track, int64_t num_tracks,
-    int64_t *around, int64_t *num, double *slab) {
+    const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *transform, const int32_t *track,
+    int64_t num_tracks, int64_t *around, int64_t *num, double *slab) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
     int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
     int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
     double *scores = calloc((size_t)(num_tracks * width + 1), sizeof *scores);
-    int64_t status = view && start && own && scores ? DONE : NO_MEMORY;
+    double *nuisance = malloc((size_t)(2 * width * n + 1) * sizeof *nuisance);
+    int64_t status = view && start && own && scores && nuisance ? DONE : NO_MEMORY;
     if (status == DONE) {
         surroundings near = {view, own, around, start, 0, 0};
         collect(m, first, first + n, image, place, &near);
+        take_nuisance(m, first, n, transform, nuisance);
         for (int64_t i = 0; i < n; i++) {
-            const double *dx = m->design + (first + i) * 2 * width, *dy = dx + width;
+            const double *dx = nuisance + 2 * i * width, *dy = dx + width;
             double x = m->weight[first + i] * m->left[2 * (first + i)], y = m->weight[first + i] * m->left[2 * (first + i) + 1];
             double *to = scores + width * (track[i] < 0 ? -1 - track[i] : track[i]);
             for (int64_t c = 0; c < width; c++) to[c] += dx[c] * x + dy[c] * y;
@@ -546,7 +568,7 @@ WIDE KERNEL int64_t joint_meat(
         for (int64_t c = 0; near.num_images && c < width * width; c++) slab[c] *= 0.5;
         num[0] = near.num_images;
     }
-    free(view), free(start), free(own), free(scores);
+    free(view), free(start), free(own), free(scores), free(nuisance);
     return status;
 }
 
@@ -603,15 +625,15 @@ KERNEL int64_t joint_along_design(const joint_model *m, const double *values, do
 }
 
 /* The fields of an image: scalar (n, SCALAR) 1, x, y, x^2, .. y^4 of the predicted point, 0; dense (n, 2, DENSE): radial,
- * tangential, design columns times the row coordinate, the next radial term, 0 (audit/misfit/fields.py, audit/joint).
+ * tangential, derivatives in the pose times the row coordinate, the next radial term, 0 (audit/misfit/fields.py, audit/joint).
  *
- * facts: R (9), t (3) of cam_from_world, fx, fy, half width, half height, half of the larger one, height.
+ * facts: R (9), t (3) of cam_from_world, fx, fy, half width, half height, half of the larger one, height, R^-1 (9).
  * xyz (n, 3) world, predicted (n, 2) px. fisheye: u is theta (X, Y) / rho. power: of r^2 in the next term, 0 for none. */
 WIDE KERNEL int64_t joint_fields(
     const joint_model *m, int64_t image, const double *facts, const double *xyz, const double *predicted, int64_t fisheye,
     int64_t power, double *scalar, double *dense) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
-    const double *r = facts, *t = facts + 9;
+    const double *r = facts, *t = facts + 9, *inverse = facts + 18;
     double all = 0.0; /* of everything: NaN or infinite where a field is */
     double fx = facts[12], fy = facts[13], middle_x = facts[14], middle_y = facts[15], half = facts[16], height = facts[17];
     for (int64_t i = 0; i < n; i++) {
@@ -637,7 +659,11 @@ WIDE KERNEL int64_t joint_fields(
         for (int64_t k = 0; k < power; k++) next *= r2;
         d[0] = sx * (r2 * r2), e[0] = sy * (r2 * r2), d[1] = d[0] * r2, e[1] = e[0] * r2;
         d[2] = fx * cross, e[2] = fy * (r2 + 2.0 * v * v), d[3] = fx * (r2 + 2.0 * u * u), e[3] = fy * cross;
-        for (int c = 0; c < 6; c++) d[4 + c] = dx[c] * along, e[4 + c] = dy[c] * along;
+        for (int c = 0; c < 3; c++) { /* in the camera's axes: along the view a long lens sees next to nothing */
+            d[4 + c] = dx[c] * along, e[4 + c] = dy[c] * along;
+            d[7 + c] = (dx[3] * inverse[c] + dx[4] * inverse[3 + c] + dx[5] * inverse[6 + c]) * along;
+            e[7 + c] = (dy[3] * inverse[c] + dy[4] * inverse[3 + c] + dy[5] * inverse[6 + c]) * along;
+        }
         d[10] = sx * next, e[10] = sy * next, d[11] = 0.0, e[11] = 0.0;
         for (int c = 0; c < 2 * DENSE; c++) all += d[c];
         all += f[10] + f[14];
