@@ -288,7 +288,8 @@ class JointSums:
         status = function(ctypes.byref(self._model), place, image_idx, views, *given, *found)
         if status != DONE:
             return None
-        return NormalOfImage(around[: int(num[0])], slabs[:, : int(num[0])], grams, rights)
+        m = int(num[0])  # copies: room was for everybody
+        return NormalOfImage(around[:m].copy(), slabs[:, :m].copy(), grams, rights)
 
     def meat(self, image_idx: int, transform: FloatArray) -> tuple[IntArray, FloatArray] | None:
         """(m,) the image and those behind it that see its points; (m, C, C) scores times its own, summed.
@@ -304,7 +305,7 @@ class JointSums:
         slab = np.empty((most, width, width))
         given = doubles(transform, (width, width)), *self.tracks(image_idx)
         status = function(ctypes.byref(self._model), place, image_idx, views, *given, around, num, slab)
-        return (around[: int(num[0])], slab[: int(num[0])]) if status == DONE else None
+        return (around[: int(num[0])].copy(), slab[: int(num[0])].copy()) if status == DONE else None
 
     def off_points(
         self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True
