@@ -13,6 +13,7 @@ from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
 from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_parameters
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
+from sfm_audit.audit.joint.observations import usable_images
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
 from sfm_audit.audit.joint.poses import PoseCovariance, pose_covariances, unknown_pose
 from sfm_audit.audit.joint.system import JointSystem, joint_system
@@ -74,7 +75,8 @@ def audit_jointly(
     with_poses : whether to say how well poses are known
     """
     parts = []
-    for block in covisible_blocks(model, residuals, max_columns, frame_idx):
+    usable = usable_images(model, residuals, sigma_px) & (True if left_out is None else ~left_out)
+    for block in covisible_blocks(model, residuals, max_columns, frame_idx, usable):
         outside = ~block.members if left_out is None else ~block.members | left_out
         system = joint_system(
             model,

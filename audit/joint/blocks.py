@@ -26,9 +26,15 @@ class Block:
 
 
 def covisible_blocks(
-    model: SparseModel, residuals: ModelResiduals, max_columns: int, frame_idx: IntArray | None = None
+    model: SparseModel,
+    residuals: ModelResiduals,
+    max_columns: int,
+    frame_idx: IntArray | None = None,
+    usable: BoolArray | None = None,
 ) -> list[Block]:
     """Split a model into blocks of at most ``max_columns`` columns each; one block of all images where that is enough.
+
+    ``usable`` (I,): images that may have columns; the others cost nothing and go with their neighbours. All when None.
 
     Cores are runs of the reverse Cuthill-McKee order of the covisibility graph; the images that share most points with
     a core join it. Images of one frame stay together. What lies outside of a block is dropped with its observations:
@@ -36,7 +42,7 @@ def covisible_blocks(
     """
     num_images = len(model.images)
     frames = np.arange(num_images) if frame_idx is None else np.unique(frame_idx, return_inverse=True)[1]
-    width = _widths(model, frames)
+    width = _widths(model, frames, np.ones(num_images, dtype=bool) if usable is None else usable)
     if width.sum() <= max_columns:
         everything = np.ones(num_images, dtype=bool)
         return [Block(everything, everything)]
@@ -57,14 +63,15 @@ def covisible_blocks(
     return blocks
 
 
-def _widths(model: SparseModel, frames: IntArray) -> FloatArray:
+def _widths(model: SparseModel, frames: IntArray, usable: BoolArray) -> FloatArray:
     """(F,) columns of each frame; a camera's are shared out among its frames."""
     count = np.array([len(fitted_param_idxs(model.camera(c).model)) for c in range(len(model.cameras))], dtype=float)
     camera = model.images.camera_idx
     per_image = np.zeros(len(camera))
-    known = camera >= 0
+    known = (camera >= 0) & usable
     per_image[known] = count[camera[known]] / np.bincount(camera[known], minlength=len(count))[camera[known]]
-    return np.asarray(NUM_POSE + np.bincount(frames, per_image))
+    own = np.bincount(frames, per_image)
+    return np.asarray(own + NUM_POSE * (np.bincount(frames, usable) > 0))
 
 
 def _covisibility(residuals: ModelResiduals, frames: IntArray, num_points: int) -> sparse.csr_array:

@@ -115,6 +115,12 @@ class JointObservations:
         return image_inliers(self.model, self.residuals, image_idx, source)
 
 
+def usable_images(model: SparseModel, residuals: ModelResiduals, sigma_px: FloatArray) -> BoolArray:
+    """(I,) images with a camera, 20 inliers or more, and known noise (``sigma_px`` (I,)): others have no columns."""
+    known = np.isfinite(sigma_px) & (sigma_px > 0)
+    return np.asarray((np.diff(residuals.offsets) >= MIN_INLIERS) & known & (model.images.camera_idx >= 0))
+
+
 def joint_observations(
     model: SparseModel,
     residuals: ModelResiduals,
@@ -132,8 +138,7 @@ def joint_observations(
     views left or with a singular V (two rays that are parallel) are left out with their observations.
     """
     counts = np.diff(residuals.offsets)
-    known = np.isfinite(sigma_px) & (sigma_px > 0)
-    used = (counts >= MIN_INLIERS) & known & (model.images.camera_idx >= 0)
+    used = usable_images(model, residuals, sigma_px)
     used &= ~left_out if left_out is not None else True
     used &= _finite_images(residuals)
     weight = _weights(residuals, np.where(used, sigma_px, np.nan), counts)

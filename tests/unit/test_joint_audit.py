@@ -46,6 +46,17 @@ def test_frames_are_not_cut_by_blocks(chain):
         assert (block.core.reshape(10, 3).any(axis=1) == block.core.reshape(10, 3).all(axis=1)).all()
 
 
+def test_images_without_columns_take_no_room_in_a_block(chain):
+    """Twenty of thirty images could not have columns: what is left fits one block, and everybody is answered for."""
+    residuals = ModelAuditor(chain).residuals
+    usable = np.arange(30) % 3 == 0
+    assert len(covisible_blocks(chain, residuals, 80, usable=usable)) == 1
+    blocks = covisible_blocks(chain, residuals, 40, usable=usable)
+    assert len(blocks) > 1
+    assert (np.sum([b.core for b in blocks], axis=0) == 1).all()
+    assert len(covisible_blocks(chain, residuals, 1, usable=np.zeros(30, dtype=bool))) == 1
+
+
 def test_blocks_say_nearly_what_one_system_says(chain):
     whole, parts = audited(chain), audited(chain, max_columns=160)
     assert whole.num_blocks == 1
