@@ -254,6 +254,14 @@ def test_a_group_has_hotelling_s_p_and_the_length_of_what_it_explains():
     assert (result.rank, result.status) == (2, S.TESTED)
 
 
+def test_scores_of_different_size_are_weighed_by_their_own_spread():
+    meat = np.array([[4e4, 300.0], [300.0, 9.0]])
+    given = replace(scores(), meat=meat, score=np.array([700.0, 2.0]))
+    z, spread = given.score / math.sqrt(80), meat / 80
+    t = z @ np.linalg.solve(spread, z)
+    assert hotelling(given).p == pytest.approx(stats.f.sf(t / (60 - t) * (60 - 2) / 2, 2, 58), rel=1e-9)
+
+
 def test_more_tracks_than_observations_count_as_many_as_there_are_observations():
     given = scores(num_tracks=60, num=50)
     z, spread = given.score / math.sqrt(50), given.meat / 50
@@ -344,3 +352,32 @@ def test_the_root_whitens_the_fields_of_an_image_in_their_own_units():
     wide = replace(scores(), gram=gram, sq_length=np.diag(gram) * np.array([1.0, 1.5, 2.0]))
     root = group_root(wide, slice(0, 3))
     np.testing.assert_allclose(root @ gram @ root.T, np.eye(3), atol=1e-9)
+
+
+def test_a_stack_of_images_is_judged_as_each_of_them_alone():
+    """Different ranks, lengths, numbers of tracks, and one that is not finite: nobody hears of the others."""
+    gram = np.array([[80.0, 30.0], [30.0, 70.0]])
+    several = [
+        scores(seed=1, gram=gram),
+        scores(seed=2, gram=np.diag([80.0, 0.0]), num=90),
+        replace(scores(seed=3), sq_length=np.array([40.0, 160.0])),
+        scores(seed=4, gram=np.full((2, 2), NAN)),
+        scores(num_tracks=3, num=30, seed=5),
+        replace(scores(seed=6), meat=np.ones((2, 2))),
+        replace(scores(seed=7), sq_length=np.array([0.0, 80.0])),
+    ]
+    own, sigma_px, rms_px = slice(0, 2), np.linspace(0.3, 0.9, 7), np.full(7, 9.0)
+    rms_px[2] = 1e-3
+    together = group_test.test_groups(several, own, sigma_px, rms_px)
+    assert [test.status for test in together] == [
+        *(S.TESTED, S.TESTED, S.NOT_ESTIMABLE, S.NOT_FINITE, S.NOT_ENOUGH_EVIDENCE, S.SINGULAR, S.TESTED)
+    ]
+    for k, each in enumerate(several):
+        root = group_root(each, own)
+        alone = group_test.test_group(each, own, root, sigma_px=sigma_px[k], rms_px=rms_px[k])
+        assert (together[k].rank, together[k].status) == (alone.rank if k != 3 else None, alone.status)
+        assert together[k][:3] == pytest.approx(alone[:3], nan_ok=True)
+        if together[k].status is S.TESTED and len(root) == 2:
+            whitened = root @ each.gram @ root.T
+            assert whitened == pytest.approx(np.eye(2), abs=1e-12)
+    assert group_test.test_groups([], own, np.zeros(0), np.zeros(0)) == []
