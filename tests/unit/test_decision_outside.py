@@ -70,6 +70,21 @@ def test_a_witness_that_disagrees_is_named_with_its_numbers(may_reject, witness)
     assert decide(sound(testimonies=(against,)), SETTINGS).verdict == may_reject
 
 
+def test_images_that_witnesses_contradict_have_each_its_own_reasons(may_reject):
+    said = [(replace(AGAINST, score=0.1 * k, text=f"{k} of 10 pairs"),) for k in (9, 6, 7)]
+    twice = replace(AGAINST, score=0.8, limit=0.4, text="8 of 10 pairs")
+    images = [said[0], (AGREES,), (*said[1], twice), said[2]]
+    found = judge_outside(Measured.of([sound(testimonies=each) for each in images]), SETTINGS)
+    assert [VERDICTS[place] for place in found.verdict] == [may_reject, Verdict.ACCEPTED, may_reject, may_reject]
+    first, second = found.said
+    assert first.rows.tolist() == [0, 2, 3]
+    told = [first.reason(k) for k in range(3)]
+    assert [(each.text, each.value, each.limit) for each in told] == [
+        (f"{k} of 10 pairs", 0.1 * k, 0.5) for k in (9, 6, 7)
+    ]
+    assert (second.rows.tolist(), second.reason(0).value, second.reason(0).limit) == ([2], 0.8, 0.4)
+
+
 @pytest.mark.parametrize(
     ("score", "q", "against"),
     [(0.51, 0.04, True), (0.5, 0.04, False), (0.51, 0.05, False), (0.51, float("nan"), True), (float("nan"), 0, False)],
