@@ -76,7 +76,7 @@ TARGETS: Final = (
     Target("audit/decision/columns.py", (_SAME_TABLE,), ("_policy_reasons", "_offsets")),
     Target(
         "audit/engine/known.py",
-        (f"{_COLUMNS}::test_what_decides_is_that_of_each_image",),
+        ("unit/test_engine_known.py", f"{_COLUMNS}::test_what_decides_is_that_of_each_image"),
         ("_steps", "_unusable", "_parts", "_own", "_camera", "_sd_k1", "_misfit"),
     ),
     Target(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from decision_samples import (
     ABSORBED,
@@ -36,8 +37,10 @@ from decision_samples import (
 )
 
 from sfm_audit.audit.config import AuditConfig
-from sfm_audit.audit.decision.decide import decide
+from sfm_audit.audit.decision.decide import decide, decide_all
 from sfm_audit.audit.decision.diagnostics import SharedMisfit
+from sfm_audit.audit.decision.judged import NOT_ASKED, VERDICTS, Judged
+from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.table.words import (
     GROUPS,
     POLICIES,
@@ -366,3 +369,12 @@ def test_a_row_of_a_finished_run_is_counted_by_the_same_members(policy, wrong):
 )
 def test_one_rejection_rejects_and_undetermined_is_no_pass(verdicts, said):
     assert strongest(verdicts) is said
+
+
+def test_who_was_not_asked_by_a_policy_is_undetermined():
+    verdicts = (REJECTED, ACCEPTED, UNDETERMINED)
+    members = {member: Judged(np.full(4, NOT_ASKED), ()) for member in M}
+    members[M.KS] = Judged(np.array([*(VERDICTS.index(each) for each in verdicts), NOT_ASKED]), ())
+    found = replace(decide_all(Measured.of([SOUND] * 4), AuditConfig(policy="paper")), members=members)
+    assert [VERDICTS[place] for place in found.verdict] == [*verdicts, UNDETERMINED]
+    assert [VERDICTS[place] for place in found.under("standard")] == [UNDETERMINED] * 4
