@@ -73,7 +73,11 @@ TARGETS: Final = (
         (*DECISION, f"{_COLUMNS}::test_a_decision_does_not_depend_on_the_images_beside"),
         ("Decision.under", "deciders", "Decisions.under", "Decisions.rejects", "Decisions.decision"),
     ),
-    Target("audit/decision/columns.py", (_SAME_TABLE,), ("_policy_reasons", "_offsets")),
+    Target(
+        "audit/decision/columns.py",
+        (f"{_COLUMNS}::test_each_sentence_is_told_once_of_each_image", _SAME_TABLE),
+        ("_policy_reasons", "_offsets"),
+    ),
     Target(
         "audit/engine/known.py",
         ("unit/test_engine_known.py", f"{_COLUMNS}::test_what_decides_is_that_of_each_image"),

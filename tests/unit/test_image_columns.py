@@ -33,8 +33,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.decision.columns import _policy_reasons
 from sfm_audit.audit.decision.decide import decide, decide_all
+from sfm_audit.audit.decision.decisions import Reasons
 from sfm_audit.audit.decision.diagnostics import Gains, SharedMisfit
+from sfm_audit.audit.decision.judged import Said as Kind
 from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.engine.error_summary import error_summary
 from sfm_audit.audit.engine.images import audit_images
@@ -214,3 +217,11 @@ def test_errors_are_numpy_s(counts, seed, scale):
         wanted = np.sqrt((length**2).mean()), length.mean(), *np.quantile(length, [0.5, 0.95, 1.0])
         assert_allclose(row, wanted, rtol=1e-12, atol=1e-160)
     assert_allclose(found.longest_px, [longest_px(residuals_px[:, a:b]) for a, b in pairwise(residuals.offsets)])
+
+
+def test_each_sentence_is_told_once_of_each_image():
+    about, nan = (ReasonCode.MISSING_CAMERA, Member.MISFIT, "", None), np.full(4, NAN)
+    one = Kind(*about, np.arange(4), ["a", "b", "c", "a"], nan, nan)
+    two = Kind(*about, np.array([0, 3]), ["b", "a"], nan[:2], nan[:2])
+    told = _policy_reasons(Reasons.of((one, two)), "standard", np.zeros(4, dtype=bool))
+    assert told.offsets.tolist() == [0, 2, 3, 4, 5]
