@@ -97,13 +97,13 @@ def test_verbose_says_each_step_on_stderr_and_the_log_keeps_them_with_times(data
     args = ["run", str(data), "-o", "RUN", "--jobs", "1"]
     assert main([*args, "-v", "--log-file", "audit.log"]) == 0
     err = capsys.readouterr().err
-    steps = ["2 models, ", "audited ", "audited ", "exit code 0"]
-    assert [step in line for step, line in zip(steps, err.splitlines(), strict=True)] == [True] * 4
+    steps = ["computing with ", "2 models, ", "audited ", "audited ", "exit code 0"]
+    assert [step in line for step, line in zip(steps, err.splitlines(), strict=True)] == [True] * 5
     assert main([*args, "nowhere", "--log-file", "audit.log", "--quiet"]) == 3
     lines = Path("audit.log").read_text(encoding="utf-8").splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ (INFO|ERROR) ", line) for line in lines)
-    assert [line.split(" ", 1)[1] for line in lines[4:]] == [
-        f"INFO run {data} nowhere -o RUN: 2 models, {lines[0].rsplit(', ', 1)[1]}",
+    assert [line.split(" ", 1)[1] for line in lines[6:]] == [
+        f"INFO run {data} nowhere -o RUN: 2 models, {lines[1].rsplit(', ', 1)[1]}",
         f"INFO unchanged, kept {data}/a/sparse/0",
         f"INFO unchanged, kept {data}/b/sparse/0",
         "ERROR nowhere: expected a folder, found nothing; check the path",
