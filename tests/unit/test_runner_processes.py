@@ -24,7 +24,7 @@ from sfm_audit.audit.schedule.task import Audited, Failure, Task, audit_one
 from sfm_audit.audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
 from sfm_audit.loaders import discover, open_model
 
-GB = 1_000_000_000
+GB = 8 * BYTES_WORTH_A_SHARE
 CONFIG = AuditConfig()
 
 
