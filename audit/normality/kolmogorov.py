@@ -221,8 +221,8 @@ def _durbin_shape(size: int) -> tuple[FloatArray, FloatArray]:
 def _pelz_good_cdf(x: _Numbers, num_values: _Numbers | int | IntArray) -> _Numbers:
     r"""P(sqrt(N) D_N < x) = K0 + K1 / sqrt(N) + K2 / N + K3 / N^(3/2), Pelz & Good's equations."""
     x2 = x * x
-    s0, s1, s2, s3 = _ODD_POWERS @ np.exp(np.divide.outer(_ODD, -2.0 * x2))
-    t1, t2 = _WHOLE_POWERS @ np.exp(np.divide.outer(_WHOLE, -2.0 * x2))
+    s0, s1, s2, s3 = _sums(_ODD_POWERS, np.exp(np.divide.outer(_ODD, -2.0 * x2)))
+    t1, t2 = _sums(_WHOLE_POWERS, np.exp(np.divide.outer(_WHOLE, -2.0 * x2)))
     k0 = s0 / x
     k1 = (s1 - x2 * s0) / (6.0 * x**4)
     k2 = ((6.0 * x2 + 2.0) * x2**2 * s0 + (2.0 * x2 - 5.0) * x2 * s1 + (1.0 - 2.0 * x2) * s2) / (72.0 * x**7) - (
@@ -237,3 +237,11 @@ def _pelz_good_cdf(x: _Numbers, num_values: _Numbers | int | IntArray) -> _Numbe
     root = np.sqrt(num_values)
     cdf: _Numbers = math.sqrt(2.0 * math.pi) * (k0 + (k1 + (k2 + k3 / root) / root) / root)
     return cdf
+
+
+def _sums(powers: FloatArray, terms: FloatArray) -> FloatArray:
+    """(p, ...) sums of terms (k, ...) times powers (p, k), one term after the other.
+
+    Not a product of matrices: that adds in an order which depends on how many samples there are beside this one.
+    """
+    return np.asarray(sum(np.multiply.outer(column, term) for column, term in zip(powers.T, terms, strict=True)))

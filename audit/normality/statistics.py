@@ -57,14 +57,17 @@ def _is_usual(stack: FloatArray) -> BoolArray:
 
 
 def _of_stack(stack: FloatArray) -> FloatArray:
-    """Statistics (B, c) of samples (B, n, 2)."""
+    """Statistics (B, c) of samples (B, n, 2).
+
+    Sums along rows only: products with a vector and einsum add in an order that depends on how many samples there are.
+    """
     values = np.ascontiguousarray(stack).reshape(len(stack), -1)
     num_values = values.shape[1]
     mean = values.mean(axis=1)
     deviation = values - mean[:, None]
     square = deviation * deviation
     m2 = square.mean(axis=1)
-    m3, m4 = np.einsum("ij,ij->i", square, deviation) / num_values, np.einsum("ij,ij->i", square, square) / num_values
+    m3, m4 = (square * deviation).mean(axis=1), (square * square).mean(axis=1)
     ascending = np.sort(values, axis=1)
     sd = np.sqrt(m2 * num_values / (num_values - 1))
     half_squares = np.sort(0.5 * (stack[:, :, 0] * stack[:, :, 0] + stack[:, :, 1] * stack[:, :, 1]), axis=1)
@@ -97,7 +100,8 @@ def _of_order(ascending: FloatArray) -> list[FloatArray]:
     second, span_2 = (score[1], span[:, 1]) if half > 1 else (0.0, np.zeros(len(span)))
     ones = np.ones(len(ascending))
     constants = [2.0 * float(score @ score) * ones, score[0] * ones, second * ones]
-    return [*constants, span[:, 2:] @ score[2:], span[:, 0], span_2, np.einsum("ij,ij->i", deviation, deviation)]
+    projection_rest, total_sq = (span[:, 2:] * score[2:]).sum(axis=1), (deviation * deviation).sum(axis=1)
+    return [*constants, projection_rest, span[:, 0], span_2, total_sq]
 
 
 @lru_cache(maxsize=64)

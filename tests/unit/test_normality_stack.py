@@ -66,3 +66,18 @@ def test_p_values_of_one_size(num_values):
     assert_allclose(
         kolmogorov.kolmogorov_p_of(distances, np.full(len(distances), num_values)), expected, rtol=1e-9, atol=1e-300
     )
+
+
+@pytest.mark.parametrize("num_points", [2, 5, 19, 39, 40, 65, 300, 5001])
+def test_the_bits_of_a_sample_do_not_depend_on_those_beside_it(num_points):
+    """Tables must not depend on how images are spread over processes."""
+    rng = np.random.default_rng(num_points)
+    samples = list(rng.standard_t(5, (9, num_points, 2)) * rng.uniform(0.7, 1.3, (9, 1, 1)))
+    together = normality.normality_columns_of(samples)
+    for first, last in [(0, 1), (3, 4), (0, 2), (2, 6), (8, 9)]:
+        apart = normality.normality_columns_of(samples[first:last])
+        for name, column in together.items():
+            assert apart[name].tobytes() == column[first:last].tobytes(), name
+    mixed = normality.normality_columns_of([samples[0], rng.standard_normal((2 * num_points, 2)), *samples[1:4]])
+    for name, column in together.items():
+        assert mixed[name][[0, 2, 3, 4]].tobytes() == column[:4].tobytes(), name

@@ -305,6 +305,7 @@ def test_memory_does_not_grow_with_the_number_of_models(run_folder):
     peaks = []
     for times in (200, 1200):
         Repeated.times = times
+        render_summary(many, Page(80))  # fills caches of libraries, which would count for whichever comes first
         tracemalloc.start()
         try:
             page = render_summary(many, Page(80))
@@ -313,7 +314,7 @@ def test_memory_does_not_grow_with_the_number_of_models(run_folder):
             tracemalloc.stop()
         assert f"{2 * times} models; the {MAX_MODELS} with the largest share" in page
         assert f"(and in {times - 1} other models)" in page
-    assert peaks[1] < 1.1 * peaks[0]
+    assert peaks[1] < 1.25 * peaks[0]  # 1000 bytes kept of each model would double it
 
 
 def test_models_are_shown_in_the_order_of_their_names_whatever_the_order_of_the_parts(run_folder):
