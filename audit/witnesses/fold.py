@@ -35,6 +35,8 @@ MIN_MIXED: Final = 0.7
 _MIN_GROUP: Final = 3
 _MIN_EITHER: Final = 8  # points that either of two images sees and both should
 _NUM_SPLITS: Final = 3
+_KNOWN: Final = 1e-6
+"""Smaller parts of an eigenvector, and smaller distances between eigenvalues, of the largest are taken for rounding."""
 _FULL_BELOW: Final = 20.0  # entries of a full matrix per product of a sparse one
 _FULL_AT_ONCE: Final = 1 << 21  # numbers: 16 MB
 _STEP_DEG: Final = 1.0  # pairs are compared with pairs of the same angle
@@ -80,10 +82,10 @@ class PairSums:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ClosePairs:
+class ClosePairs:
     """Pairs of images (k,) that are close enough to see the same: points that both or either see and both should.
 
-    step: the angle between them, in steps.    num_images: of the model.
+    step: the angle between them, in steps.
     """
 
     first: IntArray
@@ -91,7 +93,10 @@ class _ClosePairs:
     both: FloatArray
     either: FloatArray
     step: IntArray
-    num_images: int
+
+    def of_those(self, kept: BoolArray) -> ClosePairs:
+        """Return the pairs of a mask (k,)."""
+        return ClosePairs(self.first[kept], self.second[kept], self.both[kept], self.either[kept], self.step[kept])
 
 
 def ask_fold(evidence: Evidence) -> WitnessReport | None:
@@ -124,7 +129,7 @@ def find_fold(seen: ShouldSee) -> Fold | None:
         return None
     sums = pair_sums(seen)
     pairs = _close_pairs(sums)
-    found = [_judged(split, pairs) for split in _splits(sums)]
+    found = [judged(split, pairs) for split in _splits(sums)]
     told = [fold for fold in found if fold is not None]
     return max(told, key=lambda fold: (fold.mixed > MIN_MIXED, fold.score), default=None)
 
@@ -165,15 +170,27 @@ def pair_sums(seen: ShouldSee) -> PairSums:
     )
 
 
-def _splits(sums: PairSums) -> Iterator[BoolArray]:
-    """Yield splits of the images by the leading eigenvectors of their co-detection, given who should see."""
+def _splits(sums: PairSums) -> Iterator[IntArray]:
+    """Yield sides (I,) 1, -1, 0 by the leading eigenvectors of the co-detection of images, given who should see."""
     size = np.sqrt(np.maximum(sums.own_rest, np.finfo(float).tiny))
     together = np.zeros((len(size), len(size)))
     together[sums.first, sums.second] = sums.rest / (size[sums.first] * size[sums.second])
     together += together.T
-    vectors = _leading(together)
-    for k in range(vectors.shape[1]):
-        yield vectors[:, k] > 0
+    yield from sides(*_leading(together))
+
+
+def sides(values: FloatArray, vectors: FloatArray) -> Iterator[IntArray]:
+    """Yield the signs of those vectors that are no arbitrary ones of an eigenspace, 0 where a sign would be rounding.
+
+    An eigenvector of a long strip of images lies in a part of it and falls off exponentially: far away it is made of
+    rounding errors, whose signs are those of the processor and of the order of images.
+    """
+    apart = -np.diff(values) > _KNOWN * values[0]
+    for k in range(_NUM_SPLITS):
+        if apart[k] and (k == 0 or apart[k - 1]):
+            vector = vectors[:, k]
+            known = np.abs(vector) > _KNOWN * np.abs(vector).max()
+            yield np.where(known, np.sign(vector), 0.0).astype(np.int64)
 
 
 def crossed(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
@@ -193,36 +210,35 @@ def crossed(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
     return out
 
 
-def _leading(symmetric: FloatArray) -> FloatArray:
-    """Return the eigenvectors of the largest eigenvalues (n, _NUM_SPLITS)."""
+def _leading(symmetric: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the largest eigenvalues (_NUM_SPLITS + 1,), largest first, and their vectors (n, _NUM_SPLITS + 1)."""
     n = len(symmetric)
-    vectors: FloatArray = eigh(symmetric, subset_by_index=(n - _NUM_SPLITS, n - 1))[1][:, ::-1]
-    return vectors
+    values, vectors = eigh(symmetric, subset_by_index=(n - _NUM_SPLITS - 1, n - 1))
+    return values[::-1], vectors[:, ::-1]
 
 
-def _close_pairs(sums: PairSums) -> _ClosePairs:
+def _close_pairs(sums: PairSums) -> ClosePairs:
     """Choose the pairs that look in one direction from one distance."""
     num = np.maximum(sums.num, 1.0)
     angle = np.degrees(np.arccos(np.clip(sums.cosine / num, -1.0, 1.0)))
     close = (sums.either >= _MIN_EITHER) & (angle < MAX_ANGLE_DEG)
     close &= np.abs(sums.log_ratio) < np.log(MAX_DISTANCE_RATIO) * num
     step = (angle[close] / _STEP_DEG).astype(np.int64)
-    return _ClosePairs(
-        sums.first[close], sums.second[close], sums.both[close], sums.either[close], step, len(sums.own_rest)
-    )
+    return ClosePairs(sums.first[close], sums.second[close], sums.both[close], sums.either[close], step)
 
 
-def _judged(split: BoolArray, pairs: _ClosePairs) -> Fold | None:
+def judged(side: IntArray, pairs: ClosePairs) -> Fold | None:
     """Measure how much less two groups see of the same; None where they are hardly beside each other."""
-    takes_part = np.zeros(pairs.num_images, dtype=np.bool_)
-    takes_part[pairs.first] = takes_part[pairs.second] = True
-    group = np.where(takes_part, np.where(split, 1, 2), 0)
-    sizes = np.bincount(group, minlength=3)
-    if min(sizes[1], sizes[2]) < _MIN_GROUP:
+    pairs = pairs.of_those((side[pairs.first] != 0) & (side[pairs.second] != 0))
+    takes_part = np.union1d(pairs.first, pairs.second)
+    sides = side[takes_part]
+    num = np.count_nonzero(sides > 0), np.count_nonzero(sides < 0)
+    if min(num) < _MIN_GROUP:
         return None
-    if sizes[2] > sizes[1]:
-        group = np.where(group > 0, 3 - group, 0)
-    across = split[pairs.first] != split[pairs.second]
+    larger = sides[0] if num[0] == num[1] else 1 if num[0] > num[1] else -1  # as many: that of the first image
+    group = np.zeros(len(side), dtype=np.int64)
+    group[takes_part] = np.where(sides == larger, 1, 2)
+    across = side[pairs.first] != side[pairs.second]
     missing = expected = num_across = 0.0
     for step in range(int(MAX_ANGLE_DEG / _STEP_DEG)):
         here = pairs.step == step
@@ -234,6 +250,6 @@ def _judged(split: BoolArray, pairs: _ClosePairs) -> Fold | None:
             num_across += 2 * np.count_nonzero(cross)
     if expected <= 0:
         return None
-    first = sizes[1] / (sizes[1] + sizes[2])
+    first = max(num) / sum(num)
     at_random = 2 * first * (1 - first) * 2 * len(pairs.step)
     return Fold(float(missing / expected), float(num_across / at_random), group)

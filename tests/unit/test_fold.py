@@ -15,7 +15,7 @@ from sfm_audit.audit.witnesses import fold
 from sfm_audit.audit.witnesses import should_see as looking
 from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.audit.witnesses.fold import MIN_SCORE, ask_fold, find_fold
-from sfm_audit.audit.witnesses.should_see import should_see
+from sfm_audit.audit.witnesses.should_see import ShouldSee, should_see
 from sfm_audit.loaders.model import FindingCode, SparseModel
 
 
@@ -69,6 +69,65 @@ def test_no_point_is_left_out_because_of_who_stands_close(monkeypatch):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
         monkeypatch.setattr(looking, "_REACH", 0.05)  # where the law of cosines is not kept, some are missing
         assert len(should_see(*given).sees) < len(expected.sees)
+
+
+NUM_STRIP = 160
+
+
+def strip(order=None, *, seed: int = 0) -> ShouldSee:
+    """A strip of images beside each other; the first fifteen are of two sides, each with points of its own."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0, NUM_STRIP, 3000)
+    point, image = np.nonzero(np.abs(np.arange(NUM_STRIP) - x[:, None]) < 2.5)
+    of_side = rng.integers(0, 2, len(x))[point] == rng.integers(0, 2, NUM_STRIP)[image]
+    sees = rng.random(len(point)) < np.where(x[point] > 15, 0.8, np.where(of_side, 0.95, 0.2))
+    ray = np.stack([(x[point] - image) / 10, np.zeros(len(point)), np.ones(len(point))])
+    if order is not None:
+        image = np.argsort(order)[image]
+        rows = np.lexsort((image, point))
+        point, image, sees, ray = point[rows], image[rows], sees[rows], ray[:, rows]
+    return ShouldSee(
+        len(x), NUM_STRIP, point, image, sees, ray / np.linalg.norm(ray, axis=0), np.full(len(point), 10.0)
+    )
+
+
+@pytest.mark.both_paths
+def test_far_from_where_an_eigenvector_lies_no_side_is_made_of_rounding():
+    """The first vector of this strip falls off to rounding errors, whose signs depend on the order of the images."""
+    expected = find_fold(strip())
+    assert 8 <= np.count_nonzero(expected.group) < NUM_STRIP / 2
+    assert not expected.group[NUM_STRIP // 2 :].any()
+    for seed in range(5):
+        order = np.random.default_rng(seed).permutation(NUM_STRIP)
+        found = find_fold(strip(order))
+        assert found.score == pytest.approx(expected.score, rel=1e-9)
+        assert found.mixed == pytest.approx(expected.mixed, rel=1e-9)
+        np.testing.assert_array_equal(found.group > 0, expected.group[order] > 0)
+        assert {*zip(found.group.tolist(), expected.group[order].tolist(), strict=True)} <= {(0, 0), (1, 1), (2, 2)}
+
+
+def test_vectors_of_one_eigenvalue_are_not_used():
+    vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 4)))[0]
+    for values, used in (
+        ([4.0, 3.0, 2.0, 1.0], [0, 1, 2]),
+        ([4.0, 4.0 - 1e-7, 2.0, 1.0], [2]),
+        ([4.0, 3.0, 2.0, 2.0 - 1e-7], [0, 1]),
+        ([0.0, 0.0, 0.0, 0.0], []),
+        ([4.0, 3.0, -1.0, -2.0], [0, 1, 2]),
+    ):
+        found = np.array([*fold.sides(np.array(values), vectors)]).reshape(-1, 20)
+        np.testing.assert_array_equal(found, np.sign(vectors[:, used].T))
+
+
+def test_the_first_group_is_the_larger_one_or_that_of_the_first_image():
+    first, second = np.nonzero(np.triu(np.ones((12, 12)), 1))
+    nothing = np.zeros(len(first))
+    pairs = fold.ClosePairs(first, second, nothing + 8, nothing + 10, nothing.astype(np.int64))
+    for num, larger in ((5, -1), (6, 1), (7, 1)):
+        side = np.where(np.arange(12) < num, 1, -1)
+        for sign in (1, -1):
+            group = fold.judged(sign * side, pairs).group
+            np.testing.assert_array_equal(group, np.where(side == larger, 1, 2))
 
 
 def test_small_models_are_not_asked():
