@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.noise.stack import constant_noises, track_noises
-from sfm_audit.audit.noise.standardise import constant_noise, track_noise
+from sfm_audit.audit.noise.stack import constant_fits, constant_noises, track_noises
+from sfm_audit.audit.noise.standardise import track_noise
 from sfm_audit.audit.normality import normality_tests_of
 from sfm_audit.loaders import open_model
 
@@ -50,13 +50,12 @@ def measure(auditor: ModelAuditor) -> dict[str, float]:
     auditor.__dict__.pop("tracks", None)
     with laps.of("tracks, prior"):
         tracks = auditor.tracks
+    with laps.of("constant noise"):
+        fits = constant_fits(residuals)
     for start in range(0, num_images, IMAGES_AT_ONCE):
         part = range(start, min(start + IMAGES_AT_ONCE, num_images))
         with laps.of("constant noise"):
-            constant = constant_noises(residuals, part)
-            for k in part:
-                if k not in constant:
-                    constant[k] = constant_noise(residuals.residuals_px[:, residuals.rows(k)])
+            constant = dict(zip(part, constant_noises(residuals, part, fits), strict=True))
         with laps.of("noise of tracks"):
             sigma_px = {k: noise.sigma_constant_px for k, noise in constant.items()}
             chosen = track_noises(tracks, part, sigma_px)

@@ -45,7 +45,9 @@ def print_steps(auditor: ModelAuditor) -> None:
     every, config, labels = range(len(auditor.model.images)), auditor.config, ModelLabels("", "", "0", "")
     tracks = auditor.tracks if config.noise == "track" else None
     noise = timed(
-        "noise and tests", len(every), partial(noise_columns, auditor.residuals, tracks, every, auditor.noise)
+        "noise and tests",
+        len(every),
+        partial(noise_columns, auditor.residuals, tracks, every, auditor.constant_fits, auditor.noise),
     )
     errors = timed("reprojection errors", len(every), partial(error_summary, auditor.residuals, every))
     known = partial(measured_of, auditor, every, noise.measured, errors.longest_px)

@@ -14,6 +14,7 @@ from sfm_audit.audit.engine.known import ModelFacts, measured_of
 from sfm_audit.audit.engine.noise_columns import noise_columns
 from sfm_audit.audit.engine.tables import ImagesPart
 from sfm_audit.audit.misfit import MisfitTests
+from sfm_audit.audit.noise.stack import ConstantFits
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders.model import CameraRecord
@@ -27,6 +28,9 @@ class Auditing(ModelFacts, Protocol):
     @property
     def tracks(self) -> ModelTracks: ...  # noqa: D102
 
+    @property
+    def constant_fits(self) -> ConstantFits: ...  # noqa: D102
+
     def noise(self, image_idx: int, constant: ImageNoise) -> ImageNoise: ...  # noqa: D102
 
     def retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests: ...  # noqa: D102
@@ -35,7 +39,8 @@ class Auditing(ModelFacts, Protocol):
 def audit_images(auditor: Auditing, image_idxs: range, labels: ModelLabels) -> list[ImagesPart]:
     """Return the part of the images table about some images, and what was decided; one part for all of them."""
     config, tracks = auditor.config, auditor.tracks
-    tested = noise_columns(auditor.residuals, tracks if config.noise == "track" else None, image_idxs, auditor.noise)
+    chosen = tracks if config.noise == "track" else None
+    tested = noise_columns(auditor.residuals, chosen, image_idxs, auditor.constant_fits, auditor.noise)
     errors = error_summary(auditor.residuals, image_idxs)
     measured = measured_of(auditor, image_idxs, tested.measured, errors.longest_px)
     decisions = decide_all(measured, config)

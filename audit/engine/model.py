@@ -48,7 +48,7 @@ from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
 from sfm_audit.audit.kernels.threads import together
 from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
-from sfm_audit.audit.noise.stack import constant_sigmas
+from sfm_audit.audit.noise.stack import ConstantFits, constant_fits
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
 from sfm_audit.audit.table import ModelLabels, build_table, schema
 from sfm_audit.audit.table.words import MisfitStatus
@@ -95,9 +95,7 @@ class ModelAuditor:
         spread: Spread = in_turn,
         given: Given = NOTHING_GIVEN,
     ) -> None:
-        self.model = model
-        self._given = given
-        self._spread = spread
+        self.model, self._given, self._spread = model, given, spread
         self.config = config or AuditConfig()
         self._keypoint_scale_px = keypoint_scale_px
         if self.config.noise == "keypoint" and keypoint_scale_px is None:
@@ -138,9 +136,14 @@ class ModelAuditor:
         )
 
     @cached_property
+    def constant_fits(self) -> ConstantFits:
+        """One robust scale of the raw residuals of each image."""
+        return constant_fits(self.residuals)
+
+    @property
     def sigma_constant_px(self) -> FloatArray:
         """Robust sd per axis of each image's raw residuals (I,), NaN where undetermined."""
-        return constant_sigmas(self.residuals)
+        return self.constant_fits.sigma_px
 
     @cached_property
     def tau_px(self) -> FloatArray:
@@ -259,7 +262,7 @@ class ModelAuditor:
         """Return what is known of an image before anything is decided, given its row."""
         rows = self.residuals.rows(image_idx)
         residuals_px = self.residuals.residuals_px[:, rows]
-        constant = constant_noise(residuals_px)
+        constant, parts = constant_noise(residuals_px), self.consistency
         return ImageEvidence(
             self.inliers(image_idx),
             residuals_px,
@@ -270,10 +273,8 @@ class ModelAuditor:
             quality=self.quality[image_idx],
             misfit=self.misfit(image_idx),
             retest=partial(self.retest, image_idx),
-            consistency=consistency_diagnostics(
-                self.consistency.images[image_idx], all_behind=self.consistency.points_behind
-            ),
-            half_pixel=self.consistency.half_pixel and bool(self.consistency.images[image_idx].half_pixel),
+            consistency=consistency_diagnostics(parts.images[image_idx], all_behind=parts.points_behind),
+            half_pixel=parts.half_pixel and bool(parts.images[image_idx].half_pixel),
             testimonies=self.outside.testimonies(image_idx),
             outside=self.outside.columns(image_idx),
             **self._of_camera(image_idx),

@@ -11,8 +11,8 @@ import numpy as np
 
 from sfm_audit.audit.decision.measured import MeasuredNoise
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.noise.stack import constant_noises, track_noises
-from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise
+from sfm_audit.audit.noise.stack import ConstantFits, constant_noises, track_noises
+from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks
 from sfm_audit.audit.normality import normality_columns_of
 from sfm_audit.audit.table.arrow import Column
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -82,18 +82,20 @@ def noise_columns(
     residuals: ModelResiduals,
     tracks: ModelTracks | None,
     image_idxs: range,
+    constant: ConstantFits,
     noise_of: Callable[[int, ImageNoise], ImageNoise],
 ) -> NoiseColumns:
     """Fit the noise of some images of a model and test what it leaves; those with few observations together.
 
     Parameters
     ----------
-    tracks : where the chosen noise model is ``track``, else None
+    tracks : where the chosen noise model is ``track``, else None        constant : of all images
     noise_of : an image's noise under the chosen model, given its row and its noise of one scale
     """
-    parts = [_fitted(_noises(residuals, tracks, part, noise_of)) for part in _parts(image_idxs, residuals.offsets)] or [
-        _fitted([])
-    ]
+    parts = [
+        _fitted(_noises(constant_noises(residuals, part, constant), tracks, part, noise_of))
+        for part in _parts(image_idxs, residuals.offsets)
+    ] or [_fitted([])]
     return NoiseColumns(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in NoiseColumns.__slots__}
     )
@@ -110,19 +112,15 @@ def _parts(image_idxs: range, offsets: IntArray) -> Iterator[range]:
 
 
 def _noises(
-    residuals: ModelResiduals,
+    constants: Sequence[ImageNoise],
     tracks: ModelTracks | None,
     part: range,
     noise_of: Callable[[int, ImageNoise], ImageNoise],
 ) -> list[tuple[ImageNoise, ImageNoise]]:
-    """The noise of each image of a part under one scale and under the chosen model."""
-    constants = constant_noises(residuals, part)
-    for image in part:
-        if image not in constants:
-            constants[image] = constant_noise(residuals.residuals_px[:, residuals.rows(image)])
-    sigma_px = {image: noise.sigma_constant_px for image, noise in constants.items()}
+    """The noise of each image of a part under one scale, which is known, and under the chosen model."""
+    sigma_px = {image: noise.sigma_constant_px for image, noise in zip(part, constants, strict=True)}
     chosens = {} if tracks is None else track_noises(tracks, part, sigma_px)
-    return [(constants[image], chosens.get(image) or noise_of(image, constants[image])) for image in part]
+    return [(own, chosens.get(image) or noise_of(image, own)) for image, own in zip(part, constants, strict=True)]
 
 
 def _fitted(noises: Sequence[tuple[ImageNoise, ImageNoise]]) -> NoiseColumns:

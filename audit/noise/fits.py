@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,8 +22,13 @@ def consistency(cutoff: float) -> float:
 
 CONSISTENCY = consistency(CUTOFF)  # kappa = 0.92053...
 _RELATIVE_CHANGE = 1e-8
-_NEWTON_CHANGE = 1e-4  # of a Newton step: what is left after it is of the order of its square
+_NEWTON_CHANGE = 1e-6  # of a step of Newton's: what is left after it is of the order of its square, but at a kink
 _MAX_ITERATIONS = 100
+_NUM_EXPECTED = 2  # first steps, with the slope that normal residuals have: Newton's would go too far
+_UNCLIPPED = math.erf(CUTOFF / math.sqrt(2.0)) - CUTOFF * math.exp(-0.5 * CUTOFF**2) * math.sqrt(2.0 / math.pi)
+
+_Theta: TypeAlias = tuple[float, float]
+_Symmetric: TypeAlias = tuple[float, float, float]  # 11, 12, 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,26 +95,27 @@ def fit_variance(sq_residuals_px2: FloatArray, predictor_px2: FloatArray) -> Var
     constant = fit_constant_variance(y)
     if not constant.converged:
         return constant
-    ends = np.array([predictor_px2.min(), predictor_px2.max()])
-    if ends[0] == ends[1]:
+    least = float(predictor_px2.min())
+    if least == predictor_px2.max():
         return constant
     excess = _excess(y, np.full(1, constant.detector_px2))
     if excess @ predictor_px2 <= 0.0:
         return constant
-    if ends[0] > 0.0:
+    if least > 0.0:
         proportional = fit_constant_variance(y / predictor_px2)
         scale = proportional.detector_px2 * predictor_px2
         if proportional.converged and (_excess(y, scale) / scale).sum() <= 0.0:
             return VarianceFit(0.0, proportional.detector_px2, converged=True)
-    previous = theta = _first_step(excess, predictor_px2, constant.detector_px2, len(y))
-    for _ in range(_MAX_ITERATIONS):
-        previous, (theta, is_newton) = theta, _next_theta(y, predictor_px2, theta)
-        scale, old = _variance(ends, theta), _variance(ends, previous)  # s / s' is monotone in a^2
+    theta = _first_step(excess, predictor_px2, constant.detector_px2, len(y))
+    ends = least, float(predictor_px2.max())
+    previous = theta
+    for i in range(_MAX_ITERATIONS):
+        previous, (theta, is_newton) = theta, _next_theta(y, predictor_px2, theta, expected=i < _NUM_EXPECTED)
         tolerance = _NEWTON_CHANGE if is_newton else _RELATIVE_CHANGE
-        if np.all(np.abs(scale - old) <= tolerance * old):
-            return VarianceFit(float(theta[0]), float(theta[1]), converged=True)
-    theta = 0.5 * (theta + previous)
-    return VarianceFit(float(theta[0]), float(theta[1]), converged=False)
+        old, new = ([each[0] + each[1] * a for a in ends] for each in (previous, theta))  # s / s' is monotone in a^2
+        if all(abs(s - before) <= tolerance * before for s, before in zip(new, old, strict=True)):
+            return VarianceFit(*theta, converged=True)
+    return VarianceFit(0.5 * (theta[0] + previous[0]), 0.5 * (theta[1] + previous[1]), converged=False)
 
 
 def _variance(predictor: FloatArray, theta: FloatArray) -> FloatArray:
@@ -120,7 +127,7 @@ def _excess(y: FloatArray, s: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(y / s, CUTOFF**2).sum(axis=0) / CONSISTENCY - len(y))
 
 
-def _first_step(excess: FloatArray, predictor: FloatArray, variance: float, num_rows: int) -> FloatArray:
+def _first_step(excess: FloatArray, predictor: FloatArray, variance: float, num_rows: int) -> _Theta:
     """`scoring_step` from (variance, 0), where it is a straight line through equally weighted responses.
 
     At that variance's own fixed point ``excess`` (m,) sums to 0, and where it grows with the predictor the line rises;
@@ -130,44 +137,59 @@ def _first_step(excess: FloatArray, predictor: FloatArray, variance: float, num_
     centred = predictor - mean
     slope = variance * float(excess @ centred) / float(centred @ centred) / num_rows
     if slope * mean <= variance:
-        return np.array([variance - slope * mean, slope])
+        return variance - slope * mean, slope
     response = variance * (1.0 + excess / num_rows)
-    return np.array([0.0, float(response @ predictor) / float(predictor @ predictor)])
+    return 0.0, float(response @ predictor) / float(predictor @ predictor)
 
 
-def _estimating_equation(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Left side (2,) of the estimating equation and its derivative (2, 2) in theta; y is (k, m), predictor (m,)."""
-    inverse = 1.0 / np.maximum(_variance(predictor, theta), np.finfo(np.float64).tiny)
+def _estimating_equation(
+    y: FloatArray, predictor: FloatArray, theta: _Theta, *, expected: bool
+) -> tuple[_Theta, _Symmetric]:
+    """Left side (2,) of the estimating equation and its derivative in theta; y is (k, m), predictor (m,).
+
+    expected : the derivative is what it is on average if y / s are squares of normal numbers
+    """
+    inverse = predictor * theta[1]
+    inverse += theta[0]
+    np.maximum(inverse, np.finfo(np.float64).tiny, out=inverse)
+    np.divide(1.0, inverse, out=inverse)
     ratio = y * inverse
-    inside = ratio < CUTOFF**2
-    first = np.minimum(ratio, CUTOFF**2).sum(axis=0)
+    first = np.add.reduce(np.minimum(ratio, CUTOFF**2), axis=0)
     first *= 1.0 / CONSISTENCY
     first -= len(y)
     first *= inverse
-    ratio *= inside
-    slope = ratio.sum(axis=0)
+    if expected:
+        slope = inverse * (len(y) * _UNCLIPPED / CONSISTENCY)
+    else:
+        np.putmask(ratio, ratio >= CUTOFF**2, 0.0)
+        slope = np.add.reduce(ratio, axis=0)
+        slope *= inverse
+        slope *= 1.0 / CONSISTENCY
+        slope += first
     slope *= inverse
-    slope *= 1.0 / CONSISTENCY
-    slope += first
-    slope *= inverse
-    weighted = slope * predictor
-    cross = -float(weighted.sum())
-    derivative = np.array([[-float(slope.sum()), cross], [cross, -float(weighted @ predictor)]])
-    return np.array([first.sum(), first @ predictor]), derivative
+    equation = float(np.add.reduce(first)), float(first @ predictor)
+    total = float(np.add.reduce(slope))
+    slope *= predictor
+    return equation, (-total, -float(np.add.reduce(slope)), -float(slope @ predictor))
 
 
-def _next_theta(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> tuple[FloatArray, bool]:
-    """One Newton step (True) if it stays near theta > 0, else one Fisher scoring step (False)."""
-    if theta.min() > 0:
-        equation, derivative = _estimating_equation(y, predictor, theta)
-        determinant = derivative[0, 0] * derivative[1, 1] - derivative[0, 1] ** 2
-        if determinant > 0 and derivative[0, 0] < 0:
-            right = derivative[1, 1] * equation[0] - derivative[0, 1] * equation[1]
-            left = derivative[0, 0] * equation[1] - derivative[0, 1] * equation[0]
-            newton = theta - np.array([right, left]) / determinant
-            if np.all(newton > 0.1 * theta) and np.all(newton < 10.0 * theta):
-                return newton, True
-    return scoring_step(y, predictor, theta), False
+def _next_theta(y: FloatArray, predictor: FloatArray, theta: _Theta, *, expected: bool) -> tuple[_Theta, bool]:
+    """One step of Newton's (True) if it stays near theta > 0, else one Fisher scoring step (False).
+
+    expected : with the slope of normal residuals (False)
+    """
+    if min(theta) > 0:
+        equation, (d00, d01, d11) = _estimating_equation(y, predictor, theta, expected=expected)
+        determinant = d00 * d11 - d01**2
+        if determinant > 0 and d00 < 0:
+            newton = (
+                theta[0] - (d11 * equation[0] - d01 * equation[1]) / determinant,
+                theta[1] - (d00 * equation[1] - d01 * equation[0]) / determinant,
+            )
+            if all(0.1 * old < new < 10.0 * old for new, old in zip(newton, theta, strict=True)):
+                return newton, not expected
+    detector, structure = scoring_step(y, predictor, np.array(theta)).tolist()
+    return (detector, structure), False
 
 
 def scoring_step(y: FloatArray, predictor: FloatArray, theta: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -29,43 +29,54 @@ _MIN_IMAGES: Final = 4
 _MAX_ITERATIONS: Final = 100
 
 
-def constant_sigmas(residuals: ModelResiduals) -> FloatArray:
-    """Return sigma_constant_px of all images (I,), NaN where undetermined."""
+class ConstantFits(NamedTuple):
+    """Noise model ``constant`` of all images: (I,) each; sigma_px NaN where undetermined."""
+
+    sigma_px: FloatArray
+    converged: BoolArray
+
+
+def constant_fits(residuals: ModelResiduals) -> ConstantFits:
+    """Fit one robust scale to the raw residuals of each image."""
     num_images = len(residuals.offsets) - 1
-    variances = np.full(num_images, math.nan)
+    variances, converged = np.full(num_images, math.nan), np.ones(num_images, dtype=np.bool_)
     if kernel.available():
         variances = kernel.constant_variances(residuals.residuals_px, residuals.offsets, CONSISTENCY)
     else:
         for size, images in _by_size(np.diff(residuals.offsets), range(num_images)):
             fits = fit_constant_variances((_residuals_px(residuals, images, size) ** 2).reshape(len(images), -1))
             variances[images] = [fit.detector_px2 for fit in fits]
+            converged[images] = [fit.converged for fit in fits]
     for image in np.flatnonzero(np.isnan(variances)).tolist():
-        variances[image] = fit_constant_variance(residuals.residuals_px[:, residuals.rows(image)] ** 2).detector_px2
-    return np.asarray(np.sqrt(variances), dtype=np.float64)
+        fit = fit_constant_variance(residuals.residuals_px[:, residuals.rows(image)] ** 2)
+        variances[image], converged[image] = fit.detector_px2, fit.converged
+    return ConstantFits(np.sqrt(variances), converged)
 
 
-def constant_noises(residuals: ModelResiduals, image_idxs: Sequence[int]) -> dict[int, ImageNoise]:
-    """Return `constant_noise` of those images that can be fitted together.
-
-    With compiled kernels nearly all, where they follow each other; else those of which several have the same, small
-    number of inliers.
-    """
-    if kernel.available() and _follow_each_other(image_idxs):
-        return _compiled_constant_noises(residuals, image_idxs)
-    out: dict[int, ImageNoise] = {}
-    for size, images in _by_size(np.diff(residuals.offsets), image_idxs):
-        residuals_px = _residuals_px(residuals, images, size)
-        fits = fit_constant_variances((residuals_px**2).reshape(len(images), -1))
-        for image, own, fit in zip(images.tolist(), residuals_px, fits, strict=True):
-            sigma = math.sqrt(fit.detector_px2)
-            out[image] = ImageNoise(own.T / sigma, sigma, sigma, math.nan, sigma, math.nan, fit.converged)
-    return out
+def constant_noises(residuals: ModelResiduals, image_idxs: range, fits: ConstantFits) -> list[ImageNoise]:
+    """Return `constant_noise` of images that follow each other, whose fits are known."""
+    offsets = residuals.offsets[image_idxs.start : image_idxs.stop + 1]
+    own = slice(image_idxs.start, image_idxs.stop)
+    standardised = np.divide(
+        residuals.residuals_px[:, offsets[0] : offsets[-1]].T,
+        np.repeat(fits.sigma_px[own], np.diff(offsets))[:, None],
+        order="C",
+    )
+    ends = (offsets - offsets[0]).tolist()
+    numbers = zip(ends, ends[1:], fits.sigma_px[own].tolist(), fits.converged[own].tolist(), strict=False)
+    return [
+        ImageNoise(standardised[start:stop], sigma, sigma, math.nan, sigma, math.nan, converged)
+        for start, stop, sigma, converged in numbers
+    ]
 
 
 def track_noises(
     tracks: ModelTracks, image_idxs: Sequence[int], sigma_constant_px: Mapping[int, float]
 ) -> dict[int, ImageNoise]:
-    """Return `track_noise` of those images that can be looked at together, as `constant_noises` says.
+    """Return `track_noise` of those images that can be looked at together.
+
+    With compiled kernels nearly all, where they follow each other; else those of which several have the same, small
+    number of verified observations.
 
     sigma_constant_px : of at least those images that are to be looked at
     """
@@ -90,23 +101,6 @@ def _residuals_px(residuals: ModelResiduals, images: IntArray, size: int) -> Flo
 
 def _follow_each_other(image_idxs: Sequence[int]) -> bool:
     return len(image_idxs) > 0 and list(image_idxs) == list(range(image_idxs[0], image_idxs[0] + len(image_idxs)))
-
-
-def _compiled_constant_noises(residuals: ModelResiduals, image_idxs: Sequence[int]) -> dict[int, ImageNoise]:
-    offsets = residuals.offsets[image_idxs[0] : image_idxs[-1] + 2]
-    sigma_px = np.sqrt(kernel.constant_variances(residuals.residuals_px, offsets, CONSISTENCY))
-    known = np.isfinite(sigma_px)
-    standardised = np.divide(
-        residuals.residuals_px[:, offsets[0] : offsets[-1]].T, np.repeat(sigma_px, np.diff(offsets))[:, None], order="C"
-    )
-    starts = (offsets - offsets[0]).tolist()
-    return {
-        image: ImageNoise(
-            standardised[starts[k] : starts[k + 1]], sigma, sigma, math.nan, sigma, math.nan, converged=True
-        )
-        for k, (image, sigma) in enumerate(zip(image_idxs, sigma_px.tolist(), strict=True))
-        if known[k]
-    }
 
 
 def _compiled_track_noises(

@@ -107,13 +107,12 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
     statistics = tracks.statistics
     rows = slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
     own = slice(int(tracks.verified_offsets[image_idx]), int(tracks.verified_offsets[image_idx + 1]))
-    verified = statistics.verified[rows]
-    whitened = statistics.whitened_px[:, rows].compress(verified, axis=1)  # rows of memory; [:, verified] has columns
+    whitened = _verified_px(statistics, rows)
     if tracks.standardiser is None or whitened.size == 0:
         empty = np.full(whitened.T.shape, math.nan)
         return ImageNoise(empty, sigma_constant_px, math.nan, math.nan, math.nan, math.nan, converged=False)
     standardised = tracks.standardiser.standardise(whitened, own)
-    paper = paper_fit(tracks, image_idx)
+    paper = _paper_fit(statistics, rows, whitened)
     factor = standardised.factor
     return ImageNoise(
         standardised.z,
@@ -128,11 +127,21 @@ def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -
 
 def paper_fit(tracks: ModelTracks, image_idx: int) -> VarianceFit:
     """The paper's form (1), with a_k of (3), for the verified observations of an image; at least one."""
-    statistics, rows = tracks.statistics, slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
+    rows = slice(int(tracks.offsets[image_idx]), int(tracks.offsets[image_idx + 1]))
+    return _paper_fit(tracks.statistics, rows, _verified_px(tracks.statistics, rows))
+
+
+def _verified_px(statistics: TrackStatistics, rows: slice) -> FloatArray:
+    """Whitened residuals (2, m) of the verified observations among rows."""
+    return statistics.whitened_px[:, rows].compress(statistics.verified[rows], axis=1)  # [:, verified] has columns
+
+
+def _paper_fit(statistics: TrackStatistics, rows: slice, whitened_px: FloatArray) -> VarianceFit:
     verified = statistics.verified[rows]
-    whitened = statistics.whitened_px[:, rows].compress(verified, axis=1)
-    predictor = statistics.other_sq_px2[rows][verified] / statistics.other_dof[rows][verified]  # a_k^2 of (3)
-    return fit_variance(whitened**2, np.minimum(predictor, _quantile(predictor, PREDICTOR_QUANTILE)))
+    predictor = statistics.other_sq_px2[rows].compress(verified)
+    predictor /= statistics.other_dof[rows].compress(verified)  # a_k^2 of (3)
+    limit = _quantile(predictor, PREDICTOR_QUANTILE)
+    return fit_variance(whitened_px * whitened_px, np.minimum(predictor, limit, out=predictor))
 
 
 def _quantile(values: FloatArray, q: float) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -12,8 +11,8 @@ from scipy import special
 
 from sfm_audit.audit.kernels import normality as compiled
 from sfm_audit.audit.kernels.normality import COLUMNS
+from sfm_audit.audit.normality.many_values import MANY_POINTS, scores, statistics_of_many
 from sfm_audit.audit.normality.samples import SAFE_MAGNITUDE
-from sfm_audit.audit.normality.shapiro import MAX_VALUES
 from sfm_audit.loaders.arrays import BoolArray, FloatArray
 
 _MAX_VALUES_AT_ONCE: Final = 1 << 18
@@ -30,11 +29,14 @@ def sample_statistics(samples: Sequence[FloatArray]) -> tuple[dict[str, FloatArr
 
 
 def _by_numpy(samples: Sequence[FloatArray], out: FloatArray) -> BoolArray:
-    """Write rows of ``out``; samples of one size together, at which numpy's overhead is paid once."""
+    """Write rows of ``out``; small samples of one size together, at which numpy's overhead is paid once."""
     found = np.zeros(len(samples), dtype=np.bool_)
     by_size: dict[int, list[int]] = {}
     for k, z in enumerate(samples):
-        by_size.setdefault(len(z), []).append(k)
+        by_size.setdefault(min(len(z), MANY_POINTS), []).append(k)
+    many = [k for k in by_size.pop(MANY_POINTS, []) if _is_usual(samples[k].reshape(1, -1))[0]]
+    if many:
+        found[many], out[many] = True, statistics_of_many([samples[k] for k in many])
     for size, members in by_size.items():
         step = max(1, _MAX_VALUES_AT_ONCE // max(2 * size, 1))
         for start in range(0, len(members) if size else 0, step):
@@ -57,7 +59,7 @@ def _is_usual(stack: FloatArray) -> BoolArray:
 
 
 def _of_stack(stack: FloatArray) -> FloatArray:
-    """Statistics (B, c) of samples (B, n, 2).
+    """Statistics (B, c) of samples (B, n, 2), n < MANY_POINTS.
 
     Sums along rows only: products with a vector and einsum add in an order that depends on how many samples there are.
     """
@@ -71,15 +73,13 @@ def _of_stack(stack: FloatArray) -> FloatArray:
     ascending = np.sort(values, axis=1)
     sd = np.sqrt(m2 * num_values / (num_values - 1))
     half_squares = np.sort(0.5 * (stack[:, :, 0] * stack[:, :, 0] + stack[:, :, 1] * stack[:, :, 1]), axis=1)
-    step = math.ceil(num_values / MAX_VALUES)
-    thinned = ascending if step == 1 else np.sort(stack[:, ::step].reshape(len(stack), -1), axis=1)
     columns = [
         _distances(special.ndtr(ascending)),
         _distances(special.ndtr((ascending - mean[:, None]) / sd[:, None])),
         _distances(-np.expm1(half_squares / -half_squares.mean(axis=1, keepdims=True))),
         _distances(-np.expm1(-half_squares)),
         *(m2, m3, m4),
-        *_of_order(thinned),
+        *_of_order(ascending),
     ]
     return np.stack(columns, axis=1)
 
@@ -93,19 +93,12 @@ def _distances(cdf: FloatArray) -> FloatArray:
 
 def _of_order(ascending: FloatArray) -> list[FloatArray]:
     """Shapiro and Wilk's sums (B,) each over samples (B, N) in ascending order."""
-    score = _scores(ascending.shape[1])
+    score, sq_sum = scores(ascending.shape[1])
     half = len(score)
     span = ascending[:, : -half - 1 : -1] - ascending[:, :half]
     deviation = ascending - ascending.mean(axis=1, keepdims=True)
     second, span_2 = (score[1], span[:, 1]) if half > 1 else (0.0, np.zeros(len(span)))
     ones = np.ones(len(ascending))
-    constants = [2.0 * float(score @ score) * ones, score[0] * ones, second * ones]
+    constants = [sq_sum * ones, score[0] * ones, second * ones]
     projection_rest, total_sq = (span[:, 2:] * score[2:]).sum(axis=1), (deviation * deviation).sum(axis=1)
     return [*constants, projection_rest, span[:, 0], span_2, total_sq]
-
-
-@lru_cache(maxsize=64)
-def _scores(num_values: int) -> FloatArray:
-    """Expected order statistics (num_values // 2,) of the largest values, largest first, as Royston takes them."""
-    rank = np.arange(1.0, num_values // 2 + 1.0)
-    return np.asarray(-special.ndtri((rank - 0.375) / (num_values + 0.25)))

@@ -125,11 +125,11 @@ def test_what_decides_is_that_of_each_image(auditor):
     every = range(len(auditor.model.images))
     audits = [auditor.image(i) for i in every]
     wanted = Measured.of([each.diagnostics for each in audits])
-    tested = noise_columns(auditor.residuals, auditor.tracks, every, auditor.noise)
+    tested = noise_columns(auditor.residuals, auditor.tracks, every, auditor.constant_fits, auditor.noise)
     found = measured_of(auditor, every, tested.measured, error_summary(auditor.residuals, every).longest_px)
     assert_same(found, wanted)
     part = range(3, 7)
-    tested = noise_columns(auditor.residuals, auditor.tracks, part, auditor.noise)
+    tested = noise_columns(auditor.residuals, auditor.tracks, part, auditor.constant_fits, auditor.noise)
     found = measured_of(auditor, part, tested.measured, error_summary(auditor.residuals, part).longest_px)
     assert_same(found, Measured.of([audits[i].diagnostics for i in part]))
 

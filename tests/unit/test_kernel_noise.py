@@ -119,15 +119,16 @@ def test_constant_noise_of_images():
         residuals.residuals_px[:, residuals.rows(1)] = 0.0
         residuals.residuals_px[0, residuals.rows(2).start] = math.nan
         residuals.residuals_px[:, residuals.rows(3)][:, 3:] = 0.0
-        found = stack.constant_noises(residuals, range(6))
-        assert sorted(found) == [0, 4, 5]
-        for image, noise in found.items():
+        fits = stack.constant_fits(residuals)
+        assert np.isfinite(fits.sigma_px).tolist() == [True, False, False, False, True, True]
+        found = stack.constant_noises(residuals, range(1, 6), fits)
+        for image, noise in enumerate(found, start=1):
             expected = constant_noise(residuals.residuals_px[:, residuals.rows(image)])
             assert_allclose(noise.sigma_constant_px, expected.sigma_constant_px, rtol=1e-12)
             assert_allclose(noise.z, expected.z, rtol=1e-12)
-        sigma = stack.constant_sigmas(residuals)
+            assert noise.converged == expected.converged
         with numpy_only():
-            assert_allclose(sigma, stack.constant_sigmas(residuals), rtol=1e-12)
+            assert_allclose(fits.sigma_px, stack.constant_fits(residuals).sigma_px, rtol=1e-12)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 8, 1001])

@@ -28,7 +28,7 @@ def assert_same(found, expected):
 
 def test_few_observations_together_are_each_by_itself(auditor):
     images = range(len(auditor.model.images))
-    constant = stack.constant_noises(auditor.residuals, images)
+    constant = dict(enumerate(stack.constant_noises(auditor.residuals, images, stack.constant_fits(auditor.residuals))))
     sigma_px = {image: noise.sigma_constant_px for image, noise in constant.items()}
     chosen = stack.track_noises(auditor.tracks, images, sigma_px)
     assert min(len(constant), len(chosen)) > 20

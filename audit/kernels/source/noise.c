@@ -4,7 +4,7 @@
  * standard normal, with the paper's two variances (method.md 2 and 3, audit/noise/fits.py and predictive.py). */
 
 #define CUTOFF_SQ 4.0
-enum { MAX_ITERATIONS = 100, CELLS_PER_UNIT = 32, LAST_CELL = 192, TABLE_ROW = 4 * (LAST_CELL + 1) };
+enum { MAX_ITERATIONS = 100, NUM_EXPECTED = 2, CELLS_PER_UNIT = 32, LAST_CELL = 192, TABLE_ROW = 4 * (LAST_CELL + 1) };
 enum { FACTOR_SQ, DETECTOR, STRUCTURE, CONVERGED, MEDIAN_SCALE, NOISE_COLUMNS };
 enum { FIT_NEEDS_NUMPY = 3 };
 
@@ -267,9 +267,12 @@ INLINE Lanes excess_of(const Image *image, int64_t k, Lanes by_s)
     return choose(rows_below(k, image->m), mass / image->kappa - 2.0, all(0.0));
 }
 
-/* Estimating equation (2) and its derivative (3: 11, 12, 22) at theta. */
-INLINE void estimating_equation(const Image *image, const double theta[2], double equation[2], double derivative[3])
+/* Estimating equation (2) and its derivative (3: 11, 12, 22) at theta; expected: as y / s has it on average if it is the
+ * square of a normal number. */
+INLINE void estimating_equation(const Image *image, const double theta[2], int expected, double equation[2],
+                                double derivative[3])
 {
+    const double unclipped = 0.73853587005088943782; /* E z^2 of |z| < c */
     Lanes e0 = all(0.0), e1 = e0, d00 = e0, d01 = e0, d11 = e0;
     for (int64_t k = 0; k < image->m; k += LANES) {
         const Lanes a = load(image->a + k), s = theta[0] + theta[1] * a, by_s = 1.0 / choose(s > DBL_MIN, s, all(DBL_MIN));
@@ -280,6 +283,8 @@ INLINE void estimating_equation(const Image *image, const double theta[2], doubl
             slope += choose(ratio < CUTOFF_SQ, ratio, all(0.0));
         }
         slope = (slope * by_s * (1.0 / image->kappa) + first) * by_s;
+        if (expected)
+            slope = choose(rows_below(k, image->m), by_s * by_s * (2.0 * unclipped / image->kappa), all(0.0));
         e0 += first, e1 += first * a;
         d00 += slope, d01 += slope * a, d11 += slope * a * a;
     }
@@ -287,13 +292,13 @@ INLINE void estimating_equation(const Image *image, const double theta[2], doubl
     derivative[0] = -sum(d00), derivative[1] = -sum(d01), derivative[2] = -sum(d11);
 }
 
-/* One step of Newton's that stays near theta > 0; 0 where there is none. */
-INLINE int newton_step(const Image *image, const double theta[2], double next[2])
+/* One step of Newton's that stays near theta > 0; 0 where there is none. expected: with the slope of normal numbers. */
+INLINE int newton_step(const Image *image, const double theta[2], int expected, double next[2])
 {
     double e[2], d[3];
     if (!(theta[0] > 0.0 && theta[1] > 0.0))
         return 0;
-    estimating_equation(image, theta, e, d);
+    estimating_equation(image, theta, expected, e, d);
     const double determinant = d[0] * d[2] - d[1] * d[1];
     if (!(determinant > 0.0 && d[0] < 0.0))
         return 0;
@@ -352,10 +357,10 @@ INLINE int fit_both(const Image *image, double variance, double least, double mo
     }
     for (int i = 0; i < MAX_ITERATIONS; i++) {
         double next[2];
-        const int newton = newton_step(image, theta, next);
+        const int newton = newton_step(image, theta, i < NUM_EXPECTED, next);
         if (!newton && !scoring_step(image, theta, next))
             return FIT_NEEDS_NUMPY;
-        const double ends[2] = {least, most}, tolerance = newton ? 1e-4 : 1e-8;
+        const double ends[2] = {least, most}, tolerance = newton && i >= NUM_EXPECTED ? 1e-6 : 1e-8;
         int still = 1;
         for (int j = 0; j < 2; j++) {
             const double before = theta[0] + theta[1] * ends[j], after = next[0] + next[1] * ends[j];
