@@ -223,7 +223,12 @@ def measure_kind(kind: str, num_images: int, num_rounds: int, *, with_runs: bool
 
 
 def start_up(times: int) -> str:
-    """Return what starting takes, as a table: a help text, an error, a small model on both paths."""
+    """Return what starting takes, as a table: a help text, an error, a small model on both paths.
+
+    Modules are compiled as pip and scripts/bootstrap leave them, whatever this machine's environment says.
+    """
+    rooms = [str(PAGE.parents[1] / room) for room in ("audit", "loaders", "reports", "sfm_audit")]
+    subprocess.run([sys.executable, "-I", "-m", "compileall", "-q", *rooms], check=False, stdout=subprocess.DEVNULL)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         simulate(folder / "model", 20)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import signal
 import sys
 import traceback
@@ -16,6 +15,7 @@ import click
 from sfm_audit.audit.cli.errors import LOGGER, Ended, ExitCode, KnownError, complain
 from sfm_audit.audit.cli.journal import journal, note, with_journal
 from sfm_audit.audit.cli.suggestions import did_you_mean
+from sfm_audit.audit.schedule.garbage import importing, leaving
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -56,7 +56,8 @@ class LazyGroup(click.Group):
         del ctx
         if cmd_name not in VERBS:
             return None
-        module = importlib.import_module(f"sfm_audit.audit.cli.{cmd_name.replace('-', '_')}")
+        with importing():
+            module = importlib.import_module(f"sfm_audit.audit.cli.{cmd_name.replace('-', '_')}")
         return with_journal(cast("click.Command", module.command))
 
     def resolve_command(
@@ -76,13 +77,19 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(VERBS.items()))
 
 
+def _version() -> str:
+    from importlib.metadata import version  # noqa: PLC0415 - takes as long as click
+
+    return version("sfm-audit")
+
+
 def _say_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
     if not asked or context.resilient_parsing:
         return
     from sfm_audit.audit.kernels import path_taken  # noqa: PLC0415 - imports numpy
 
     path = path_taken()
-    click.echo(f"sfm-audit {importlib.metadata.version('sfm-audit')}\nnumbers by {path} ({path.reason})")
+    click.echo(f"sfm-audit {_version()}\nnumbers by {path} ({path.reason})")
     context.exit()
 
 
@@ -105,7 +112,7 @@ def main(args: Sequence[str]) -> int:
         try:
             code = _answer(args)
         except Exception:
-            LOGGER.exception("a bug in sfm-audit %s", importlib.metadata.version("sfm-audit"))
+            LOGGER.exception("a bug in sfm-audit %s", _version())
             raise
         note(f"exit code {code}")
         return code
@@ -142,6 +149,7 @@ def entry_point() -> None:
     except Exception:  # noqa: BLE001 - a bug; Python's own exit code for it, 1, would say that a gate failed
         traceback.print_exc()
         exit_code = int(ExitCode.AUDIT_STOPPED)
+    leaving()
     sys.exit(exit_code)
 
 

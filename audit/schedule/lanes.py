@@ -22,6 +22,8 @@ from typing import Any, Final, Generic, Literal, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from sfm_audit.audit.schedule.garbage import importing, leaving
+
 _SPAWN: Final = multiprocessing.get_context("spawn")
 _BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _LEAVING_SECONDS: Final = 5.0  # that an idle process may take to leave before it is made to
@@ -232,8 +234,10 @@ def _serve(connection: Connection) -> None:
     os.environ.update(dict.fromkeys(_BLAS_VARIABLES, "1"))  # for libraries that the first call loads
     while True:
         try:
-            function, arguments = connection.recv()
+            with importing():  # the first call's function is imported when it arrives
+                function, arguments = connection.recv()
         except (EOFError, OSError):
+            leaving()
             return
         threadpool_limits(limits=1)  # for those that are loaded
         try:

@@ -163,7 +163,7 @@ def _has_null_elements(values: pa.Array[Any]) -> bool:
     """Whether a list of texts or of records (reasons, findings) has a null element, or one without code or text."""
     if not pa.types.is_list(values.type) or pa.types.is_floating(values.type.value_type):
         return False
-    elements = values.flatten()  # type: ignore[attr-defined]
+    elements = values.values  # type: ignore[attr-defined] # flatten() imports all of pyarrow.compute
     if elements.null_count:
         return True
     if not pa.types.is_struct(elements.type):
