@@ -27,6 +27,7 @@ from sfm_audit.audit.joint import Worth as JointWorth
 from sfm_audit.audit.table.thresholds import effect_px
 from sfm_audit.audit.table.words import GROUPS, Member, MisfitGroup, MisfitStatus, Verdict
 from sfm_audit.loaders.camera_models import BY_NAME
+from sfm_audit.loaders.model import CameraRecord
 from sfm_audit.reports.html import page
 
 
@@ -261,9 +262,9 @@ def test_noise_and_tau_of_a_shared_camera_are_medians_of_its_images():
 # what is advised
 
 
-def advice_for(material, group, rejecting=(), misfit=None):
-    """What is advised in place of an OPENCV camera without a distortion that is known."""
-    camera = SimpleNamespace(model=BY_NAME["SIMPLE_RADIAL"], params=np.array([1000.0, 800.0, 600.0, 0.0]))
+def advice_for(material, group, rejecting=(), misfit=None, *, is_measured=True, retest=None):
+    """What is advised in place of a SIMPLE_RADIAL camera without a distortion that is known."""
+    camera = CameraRecord(1, BY_NAME["SIMPLE_RADIAL"], 1600, 1200, np.array([1000.0, 800.0, 600.0, 0.0]))
     known = SimpleNamespace(parameters=SimpleNamespace(sd_of=lambda _: 1.0))
     seen = SimpleNamespace(shape=SimpleNamespace(camera=camera), identifiability=known)
     verdict = misfit or (Verdict.REJECTED if material else Verdict.ACCEPTED)
@@ -277,7 +278,7 @@ def advice_for(material, group, rejecting=(), misfit=None):
         rejects=np.array([bool(rejecting) or verdict is Verdict.REJECTED] * 2),
         members={Member.MISFIT: SimpleNamespace(verdict=np.array([VERDICTS.index(verdict)] * 2))},
     )
-    advice, of_nothing = images_advice([seen, seen], decisions, None, alpha=0.05)
+    advice, of_nothing = images_advice([seen if is_measured else None, seen], decisions, retest, alpha=0.05)
     assert of_nothing is None  # nothing was tested
     return advice
 
@@ -290,6 +291,21 @@ def test_no_smaller_model_is_advised_beside_a_rejection():
     assert advice_for((MisfitGroup.RADIAL,), MisfitGroup.RADIAL) == "RADIAL"
     assert advice_for((MisfitGroup.RADIAL,), MisfitGroup.RADIAL, rejecting=(Member.POSE,)) == "RADIAL"
     assert advice_for((MisfitGroup.RADIAL,), MisfitGroup.RADIAL, misfit=Verdict.ACCEPTED) is None  # not worth it
+
+
+def test_the_advice_holds_every_material_group_and_needs_a_camera_that_was_measured():
+    both = (MisfitGroup.RADIAL, MisfitGroup.TANGENTIAL)
+    assert advice_for(both, MisfitGroup.RADIAL) == "OPENCV"
+    assert advice_for(both, MisfitGroup.RADIAL, is_measured=False) is None
+
+
+def test_the_advice_is_tried_on_the_image_that_asks():
+    def retest(row, camera):
+        left = 1.0 if row == 0 and camera.model.name == "RADIAL" else 1e-9
+        return {each: SimpleNamespace(p=left, px=1.0) for each in GROUPS}
+
+    assert advice_for((MisfitGroup.AFFINE,), MisfitGroup.AFFINE) == "OPENCV"
+    assert advice_for((MisfitGroup.AFFINE,), MisfitGroup.AFFINE, retest=retest) == "RADIAL"  # nothing was left
 
 
 # what matters, in px and in sigma

@@ -180,6 +180,8 @@ TABLE = [
     (M.CAMERA, parts(inconsistent=None), {}, ACCEPTED, []),
     (M.CAMERA, replace(parts(inconsistent=True), largest_residual_px=0.0), {}, REJECTED, [C.INCONSISTENT]),
     (M.CAMERA, replace(parts(inconsistent=True), num_inliers=3), {}, REJECTED, [C.INCONSISTENT]),
+    (M.CAMERA, replace(parts(inconsistent=True), own=own(step_px=0.3).own), {}, REJECTED, [C.INCONSISTENT]),
+    (M.CAMERA, replace(parts(inconsistent=True), own=own(step_px=NAN).own), {}, REJECTED, [C.INCONSISTENT]),
     # verdict_camera: px on both sides of tau, |step| on both sides of 5 sd
     (M.CAMERA, own(step_px=0.2001), {}, REJECTED, [C.CAMERA_NOT_OPTIMAL]),
     (M.CAMERA, own(step_px=0.2), {}, ACCEPTED, []),
