@@ -253,7 +253,8 @@ def test_a_shared_camera_has_several_images_and_a_material_misfit():
 def test_noise_and_tau_of_a_shared_camera_are_medians_of_its_images():
     model = model_of(replace(SPEC, shared_camera=True), seed=4)
     auditor = ModelAuditor(model, AuditConfig(min_effect="0.5sigma"))
-    auditor.sigma_constant_px = np.array([0.4, 0.5, 0.6, 0.8, 0.9, 2.0, 3.0])
+    sigma_px = np.array([0.4, 0.5, 0.6, 0.8, 0.9, 2.0, 3.0])
+    auditor.constant_fits = auditor.constant_fits._replace(sigma_px=sigma_px)
     assert auditor.image(0).diagnostics.own.sigma_px == 0.8
     (camera,) = auditor.cameras
     assert camera.misfit.tau_px == 0.4
