@@ -256,6 +256,7 @@ TABLE = [
     (M.PLAUSIBLE, camera(sd_focal_rel=0.00501), {"max_sd_focal_rel": 0.01}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(sd_focal_rel=0.5, has_focal=False), {}, ACCEPTED, []),
     (M.PLAUSIBLE, camera(sd_focal_rel=NAN, is_singular=True), {}, UNDETERMINED, [C.FOCAL_NOT_IDENTIFIED]),
+    (M.PLAUSIBLE, camera(is_singular=True), {}, ACCEPTED, []),  # the joint system fixes it
     (M.PLAUSIBLE, camera(sd_focal_rel=NAN), {}, UNDETERMINED, [C.NOISE_NOT_FITTED]),
     (M.PLAUSIBLE, camera(sd_focal_rel=NAN, singular_share=NAN), {}, UNDETERMINED, [C.NON_FINITE_DERIVATIVES]),
     (M.PLAUSIBLE, camera(k1=0.002), {}, ACCEPTED, []),
