@@ -110,13 +110,23 @@ class StudentToNormal:
         np.log1p(w_sq, out=w_sq)
         w_sq *= nu
         w = np.sqrt(w_sq)
-        cell_position = w * (1.0 / _STEP)
-        outside = np.flatnonzero(cell_position >= _NUM_CELLS)
-        np.minimum(cell_position, _NUM_CELLS, out=cell_position)
-        cell = cell_position.astype(np.int64)
-        c0, c1, c2, c3 = self.coefficients.take(nu_row * (_NUM_CELLS + 1) + cell, axis=0).T
-        fraction = np.subtract(cell_position, cell, out=cell_position)
-        w *= ((c3 * fraction + c2) * fraction + c1) * fraction + c0
+        fraction = w * (1.0 / _STEP)
+        is_inside = fraction.size == 0 or fraction.max() < _NUM_CELLS
+        outside = np.empty(0, dtype=np.int64) if is_inside else np.flatnonzero(~(fraction < _NUM_CELLS))
+        if not is_inside:
+            np.minimum(fraction, _NUM_CELLS, out=fraction)
+        whole = np.floor(fraction)
+        fraction -= whole
+        cell = nu_row * (_NUM_CELLS + 1)
+        cell += whole.astype(np.int32)
+        c0, c1, c2, c3 = self.coefficients.take(cell, axis=0).T
+        ratio = np.multiply(c3, fraction, out=whole)
+        ratio += c2
+        ratio *= fraction
+        ratio += c1
+        ratio *= fraction
+        ratio += c0
+        w *= ratio
         z = np.copysign(w, t, out=w)
         if outside.size:
             z[outside] = student_to_normal(t[outside], nu[outside])
@@ -258,9 +268,9 @@ class TrackStandardiser:
         z, growth = np.empty((2, 0)), np.empty((2, 0))
         for _ in range(_MAX_ITERATIONS):
             z, growth = self._transform(image, image.t * math.exp(-log_f))
-            excess, slope = robust_excess(z, growth)
+            excess, slope = _excess(z, growth)
             low, high = (log_f, high) if excess > 0 else (low, log_f)
-            step = float(excess / slope) if slope > MIN_SLOPE else math.copysign(math.inf, excess)
+            step = excess / slope if slope > MIN_SLOPE else math.copysign(math.inf, excess)
             if abs(step) <= tolerance:
                 return _Solution(log_f, step, z, growth, converged=True)
             log_f = _inside(log_f, step, low, high)
@@ -281,7 +291,8 @@ class TrackStandardiser:
         rest = t[0] * t[0]
         rest += image.nu
         given = t.copy()
-        given[1] *= np.sqrt((image.nu + 1.0) / rest)
+        scale = image.both_nu[image.nu.size :] / rest
+        given[1] *= np.sqrt(scale, out=scale)
         given = given.reshape(-1)
         z, w_sq = self.to_normal.with_w_sq(given, image.rows, image.both_nu)
         w_sq *= image.half_power
@@ -292,7 +303,7 @@ class TrackStandardiser:
         np.exp(growth, out=growth)
         growth *= given
         own = growth.reshape(2, -1)
-        own[1] *= image.nu / rest  # the scale of y grows with x
+        own[1] *= np.divide(image.nu, rest, out=rest)  # the scale of y grows with x
         return z.reshape(2, -1), own
 
 
@@ -304,6 +315,16 @@ def robust_excess(z: FloatArray, growth: FloatArray) -> tuple[FloatArray, FloatA
     clipped = 1.0 - np.count_nonzero(inside, axis=(-2, -1)) / size
     mass, falls = (np.einsum("...ij,...ij->...", unclipped, other) / size for other in (z, growth))
     return mass + CUTOFF**2 * clipped - CONSISTENCY, 2.0 * falls
+
+
+def _excess(z: FloatArray, growth: FloatArray) -> tuple[float, float]:
+    """`robust_excess` of one image, (2, m) each."""
+    square = z * z
+    falls = z * growth
+    np.putmask(falls, square >= CUTOFF**2, 0.0)
+    np.minimum(square, CUTOFF**2, out=square)
+    mass, fallen = (float(np.add.reduce(each, axis=None)) / z.size for each in (square, falls))
+    return mass - CONSISTENCY, 2.0 * fallen
 
 
 def _inside(x: float, step: float, low: float, high: float) -> float:
