@@ -11,7 +11,7 @@ import numpy as np
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
 
-_Point: TypeAlias = tuple[float, ...]
+_Point: TypeAlias = tuple[float, float]
 _FEW: Final = 12  # points that are not worth thinning out before the hull
 _DIRECTIONS: Final = np.array([[0, 1, 1, 2, 1, 2, 1, 1], [1, 2, 1, 1, 0, -1, -1, -2]], dtype=np.float64).T
 _FLAT: Final = 1e-13  # of the squared size: what is smaller is rounding of points on one line
@@ -54,10 +54,12 @@ def hull_area_px2(xy_px: FloatArray) -> float:
 
     Notes
     -----
-    Andrew's monotone chain over what lies outside of the polygon of the extreme points in 16 directions; the area is
-    that of the triangles from the leftmost point.
+    Andrew's monotone chain over what lies outside of a box and of the polygon of the extreme points in 16 directions;
+    the area is that of the triangles from the leftmost point.
     """
-    outer = _outside_polygon(xy_px) if len(xy_px) > _FEW else xy_px
+    outer = xy_px
+    for thinned in (_outside_box, _outside_polygon):
+        outer = thinned(outer) if len(outer) > _FEW else outer
     points = sorted(map(tuple, outer.tolist()))
     if len(points) < 3:
         return 0.0
@@ -72,7 +74,11 @@ def _chain(points: list[_Point]) -> list[_Point]:
     """Return the hull from the first to the last of sorted points, which turns left everywhere."""
     out: list[_Point] = []
     for point in points:
-        while len(out) > 1 and _turn(out[-2], out[-1], point) <= 0.0:
+        x, y = point
+        while len(out) > 1:
+            (ax, ay), (bx, by) = out[-2], out[-1]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0.0:
+                break
             out.pop()
         out.append(point)
     return out
@@ -81,14 +87,23 @@ def _chain(points: list[_Point]) -> list[_Point]:
 def _fan(centre: _Point, chain: list[_Point]) -> float:
     """Twice the area of the triangles from a point to the edges of a chain."""
     twice = 0.0
-    for start, end in pairwise(chain):  # Python's sum rounds as its version likes
-        twice += _turn(centre, start, end)
+    x, y = centre
+    for (ax, ay), (bx, by) in pairwise(chain):  # Python's sum rounds as its version likes
+        twice += (ax - x) * (by - y) - (ay - y) * (bx - x)
     return twice
 
 
-def _turn(a: _Point, b: _Point, c: _Point) -> float:
-    """Twice the area of a triangle, positive where c lies to the left of the way from a to b."""
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+def _outside_box(xy_px: FloatArray) -> FloatArray:
+    """Drop points strictly inside a box between the extreme points along the diagonals: nine of ten, at little cost.
+
+    Whichever corner of the box, both edges of the quadrilateral of those points that meet beyond it are outside of it.
+    """
+    x, y = np.ascontiguousarray(xy_px.T)
+    along, across = x + y, x - y
+    most, least, right, left = along.argmax(), along.argmin(), across.argmax(), across.argmin()
+    inside = (x > max(x[least], x[left])) & (x < min(x[most], x[right]))
+    inside &= (y > max(y[least], y[right])) & (y < min(y[most], y[left]))
+    return xy_px.compress(~inside, axis=0)
 
 
 def _outside_polygon(xy_px: FloatArray) -> FloatArray:
@@ -100,7 +115,7 @@ def _outside_polygon(xy_px: FloatArray) -> FloatArray:
     normals = np.column_stack([-edges[:, 1], edges[:, 0]])
     inside = (normals @ xy_px.T > (normals * polygon).sum(axis=1)[:, None]).all(axis=0)
     inside[corners] = False  # whatever rounding says
-    return np.asarray(xy_px[~inside])
+    return xy_px.compress(~inside, axis=0)
 
 
 def _counter_clockwise(corners: FloatArray) -> FloatArray:

@@ -25,6 +25,6 @@ def coincident_keypoints(xy_px: FloatArray) -> IntArray | None:
 
 def pixels(xy_px: FloatArray) -> IntArray:
     """Return a number >= 0 of the pixel that each keypoint (n, 2) lies in, (n,)."""
-    column, row = np.floor(xy_px).astype(np.int64).T
+    column, row = np.floor(np.ascontiguousarray(xy_px.T)).astype(np.int64)
     height = int(row.max(initial=0) - row.min(initial=0)) + 1
     return np.asarray((column - column.min(initial=0)) * height + row - row.min(initial=0))
