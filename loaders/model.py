@@ -382,11 +382,12 @@ def moved(quat_wxyz: FloatArray, translation: FloatArray, xyz: FloatArray) -> Fl
     Notes
     -----
     In Eigen's order of operations (v + w u + q x u with u = 2 q x v): a point at 1e-10 units from the camera centre
-    then projects to where COLMAP projects it; a matrix product would round it elsewhere.
+    then projects to where COLMAP projects it; a matrix product would round it elsewhere. Each coordinate of the result
+    is contiguous.
     """
     w, qx, qy, qz = quat_wxyz
-    x, y, z = xyz.T
-    out = np.empty(xyz.shape)
+    x, y, z = np.ascontiguousarray(xyz.T)
+    out = np.empty(xyz.shape, order="F")
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # what is not finite projects nowhere
         ux, uy, uz = qy * z - qz * y, qz * x - qx * z, qx * y - qy * x
         ux, uy, uz = ux + ux, uy + uy, uz + uz

@@ -102,6 +102,12 @@ class Sizes:
         """Return those of some of the images."""
         return Sizes(self.num_observations[chosen], self.num_clusters[chosen])
 
+    @classmethod
+    def joined(cls, parts: Sequence[Sizes]) -> Sizes:
+        """Return those of some parts, one after the other."""
+        each = [(part.num_observations, part.num_clusters) for part in parts]
+        return cls(*map(np.concatenate, zip(*each, strict=True)))
+
 
 def tests_of_stack(found: Profiled, meat: FloatArray, leverage: FloatArray, sizes: Sizes) -> list[MisfitTests | None]:
     """Return the score tests of B images, without those of groups of which the rank or the digits are in doubt.

@@ -28,6 +28,7 @@ from sfm_audit.audit.misfit.features import (
     ImageFeatures,
     affine_offset,
     image_features,
+    meat_of,
     mixed_of,
     scores_of,
     sums_of,
@@ -182,7 +183,7 @@ def _facts(model: CameraModel) -> IntArray:
 
 
 class WindowSums:
-    """Some images of one camera model.
+    """Some images of one camera model. With numpy it holds their features, see `_FEW_OBSERVATIONS`.
 
     images: (B,) their rows.    num_observations: (B,).    num_own: q, columns of N.
     offset: (B, 2) `affine_offset` of each.
@@ -194,8 +195,14 @@ class WindowSums:
         self.offset = np.array([affine_offset(camera) for camera in cameras])
         self.num_own = 6 + len(fitted_param_idxs(cameras[0].model))
         self.num_observations = np.array([source.num_of(image) for image in images], dtype=np.int64)
+        self.model_name = cameras[0].model.name
         self._source = source
         self._window = source.window(images, cameras) if kernels_in_use() and self.num_own <= MAX_OWN else None
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether kernels are asked; then no features are held."""
+        return self._window is not None
 
     @cached_property
     def _features(self) -> list[ImageFeatures]:
@@ -233,7 +240,7 @@ class WindowSums:
             if clusters is not None:
                 num_clusters[b] -= clusters.num_merged
                 clusters.merge(g)
-            meat[b] = g @ g.T
+            meat[b] = meat_of(g, self.num_own)
         return meat, leverage, num_clusters
 
     def mixed(
