@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import pyarrow as pa
 
@@ -98,6 +98,23 @@ class Audited:
     tables: Mapping[str, pa.Table]
     seconds: float
     computed_by: str = ""
+
+    def __reduce__(self) -> tuple[Callable[..., Audited], tuple[Any, ...]]:
+        """Go to another process as Arrow streams: pickling 370 columns one by one takes 13 times as long."""
+        streams = {name: _stream_of(table) for name, table in self.tables.items()}
+        return _received, (self.state, streams, self.seconds, self.computed_by)
+
+
+def _received(state: InputState, streams: Mapping[str, bytes], seconds: float, computed_by: str) -> Audited:
+    tables = {name: pa.ipc.open_stream(stream).read_all() for name, stream in streams.items()}
+    return Audited(state, tables, seconds, computed_by)
+
+
+def _stream_of(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return sink.getvalue().to_pybytes()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,8 @@
 """Where models are audited must not be seen in the tables: processes, shares of them, and the images of one model."""
 
+import io
 import os
+import pickle
 import signal
 import tempfile
 from dataclasses import replace
@@ -9,6 +11,7 @@ from pathlib import Path
 
 import audit_stubs
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import threadpoolctl
 from corpus import UNREADABLE, corpus_models
@@ -110,6 +113,24 @@ def test_a_large_model_is_spread_by_the_runner_and_gives_the_same_bits(scene):
     expected = audit_one(task)
     assert isinstance(outcome, Audited)
     assert all(outcome.tables[name].equals(table) for name, table in expected.tables.items())
+
+
+def test_tables_that_come_from_another_process_are_written_to_the_same_bytes(scene):
+    (ref,) = discover([scene]).refs
+    here = audit_one(Task(ref, CONFIG, None, observations=True))
+    assert isinstance(here, Audited)
+    there = pickle.loads(pickle.dumps(here))  # noqa: S301 - our own
+    assert (there.state, there.seconds, there.computed_by) == (here.state, here.seconds, here.computed_by)
+    assert list(there.tables) == list(here.tables)
+    for name, table in here.tables.items():
+        assert there.tables[name].schema.equals(table.schema, check_metadata=True)
+        assert as_parquet(there.tables[name]) == as_parquet(table), name
+
+
+def as_parquet(table):
+    sink = io.BytesIO()
+    pq.write_table(table, sink)
+    return sink.getvalue()
 
 
 def test_a_model_one_of_whose_image_processes_dies_is_audited_again_in_one(scene, tmp_path):
