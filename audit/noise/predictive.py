@@ -18,6 +18,7 @@ from sfm_audit.audit.noise.prior import TrackPrior
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 _MAX_ITERATIONS = 60
+_CHUNK = 1 << 16  # observations
 _STEP = 1.0 / 32.0  # node distance of the quantile tables in w
 _TABLE_END = 6.0  # |w| beyond it (about six standard deviations) is transformed one by one
 _NUM_CELLS = round(_TABLE_END / _STEP)
@@ -67,9 +68,11 @@ def predict(
     used: BoolArray | None = None,
 ) -> Prediction:
     """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4); used: (n,) of which, all when None."""
-    own = other_dof if used is None else other_dof[used]
-    distinct = np.flatnonzero(np.bincount(own))  # small positive integers: no need to sort two million of them
-    return Prediction(prior, distinct, other_sq_px2, other_dof, used)
+    is_there = np.zeros(max(int(other_dof.max(initial=0)), 0) + 1, dtype=np.bool_)  # small: no need to sort two million
+    for start in range(0, other_dof.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        is_there[other_dof[part] if used is None else other_dof[part].compress(used[part])] = True
+    return Prediction(prior, np.flatnonzero(is_there), other_sq_px2, other_dof, used)
 
 
 class StudentToNormal:

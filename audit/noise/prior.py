@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -71,16 +71,61 @@ def fit_prior_of_tracks(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
     """`fit_track_prior` of the observations that are used (n,), all verified, with few arrays of their size."""
     num_used = int(np.count_nonzero(used))
     total_sq_px2 = float(np.add.reduce(tracks.other_sq_px2, where=used))
-    groups = None
-    if num_used >= MIN_OBSERVATIONS and total_sq_px2 < _IN_RANGE[1]:
-        groups = PriorGroups.of(tracks.whitened_px, tracks.other_sq_px2, tracks.other_dof, used)
-    if groups is None or not 0.0 < float(groups.sq_px2.sum()) < _IN_RANGE[1]:
-        sq_px2 = (tracks.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
-        return fit_track_prior(sq_px2, tracks.other_sq_px2[used], tracks.other_dof[used])
-    rows = np.flatnonzero(used)[:: max(1, num_used // _MANY)]
+    if num_used < MIN_OBSERVATIONS or not total_sq_px2 < _IN_RANGE[1]:
+        return _fit_few(tracks, used)
+    groups = PriorGroups.of(tracks.whitened_px, tracks.other_sq_px2, tracks.other_dof, used)
+    pieces = _Pieces(tracks, used)
+    own_sq_px2 = pieces.sum_of_squares() if groups is None else float(groups.sq_px2.sum())
+    if not 0.0 < own_sq_px2 < _IN_RANGE[1]:
+        return _fit_few(tracks, used)
+    rows = _every(used, max(1, num_used // _MANY))
     sq_px2 = (tracks.whitened_px[:, rows] ** 2).sum(axis=0)
     dof, other_sq_px2 = tracks.other_dof[rows], tracks.other_sq_px2[rows]
-    return _fit((sq_px2, other_sq_px2, dof), num_used, lambda: partial(_sums_by_group, groups))
+    sums = pieces.sums if groups is None else partial(_sums_by_group, groups)
+    return _fit((sq_px2, other_sq_px2, dof), num_used, lambda: sums)
+
+
+def _fit_few(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
+    """`fit_track_prior` of few observations, or of some that are out of range."""
+    sq_px2 = (tracks.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
+    return fit_track_prior(sq_px2, tracks.other_sq_px2[used], tracks.other_dof[used])
+
+
+def _every(used: BoolArray, stride: int) -> IntArray:
+    """Every stride-th of the rows (n,) that are used."""
+    found, num_before = [np.empty(0, dtype=np.int64)], 0
+    for start in range(0, used.size, _CHUNK):
+        rows = np.flatnonzero(used[start : start + _CHUNK])
+        found.append(start + rows[-num_before % stride :: stride])
+        num_before += rows.size
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pieces:
+    """Tracks, of which some observations are used (n,), a piece at a time."""
+
+    tracks: TrackStatistics
+    used: BoolArray
+
+    def __iter__(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Yield q, c and degrees of freedom."""
+        tracks = self.tracks
+        for start in range(0, self.used.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            used = self.used[part]
+            x, y = tracks.whitened_px[:, part].compress(used, axis=1)
+            sq = x * x
+            sq += y * y
+            yield sq, tracks.other_sq_px2[part].compress(used), tracks.other_dof[part].compress(used).astype(np.float64)
+
+    def sum_of_squares(self) -> float:
+        """Sum of q."""
+        return sum(float(sq.sum()) for sq, _, _ in self)
+
+    def sums(self, nu0: float, prior_sq: float) -> FloatArray:
+        """`_sums` of all pieces."""
+        return np.asarray(sum(_sums(nu0, prior_sq, *piece) for piece in self))
 
 
 _Sample = tuple[FloatArray, FloatArray, Int32Array | IntArray]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -96,10 +97,11 @@ def model_tracks(
     if math.isfinite(prior.nu0):
         prediction = predict(prior, statistics.other_sq_px2, statistics.other_dof, statistics.verified)
         standardiser = TrackStandardiser.build(prediction)
-    verified_before = np.concatenate([[0], np.cumsum(statistics.verified)])
-    return ModelTracks(
-        statistics, moved, too_many, residuals.offsets, verified_before[residuals.offsets], prior, standardiser
-    )
+    verified = [
+        np.count_nonzero(statistics.verified[first:last]) for first, last in pairwise(residuals.offsets.tolist())
+    ]
+    verified_offsets = np.concatenate([[0], np.cumsum(verified, dtype=np.int64)])
+    return ModelTracks(statistics, moved, too_many, residuals.offsets, verified_offsets, prior, standardiser)
 
 
 def track_noise(tracks: ModelTracks, image_idx: int, sigma_constant_px: float) -> ImageNoise:

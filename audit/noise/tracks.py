@@ -127,56 +127,36 @@ def _statistics(
 ) -> TrackStatistics:
     """`track_statistics` of all observations, by numpy; limits: min_track_length, min_eigenvalue."""
     min_track_length, min_eigenvalue = limits
-    n = residuals_px.shape[1]
     differentiable = _finite_columns(point_jacobian)
     if not differentiable.all():
         point_jacobian = np.where(differentiable, point_jacobian, 0.0)
     length = np.bincount(point_idx, minlength=num_points).astype(np.int32)
     inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
-    projected, complement, removable = _project_off_points(residuals_px, point_jacobian, point_idx, inverse)
-    square = _squared_lengths(projected)
-    track_sq = sum_by_point(square, point_idx, num_points)
     track_length = length.take(point_idx)
-    verified = differentiable & (track_length >= min_track_length)
-    for part in _chunks(n):
-        square[part] = track_sq.take(point_idx[part])
-    other_sq = _whiten_in_place(projected, verified, complement, square, min_eigenvalue)
+    verified = differentiable
+    verified &= track_length >= min_track_length
+    whitened, square, removable = _whiten(residuals_px, point_jacobian, point_idx, inverse, (verified, min_eigenvalue))
+    track_sq = sum_by_point(square, point_idx, num_points)
+    other_sq = square
+    for part in _chunks(len(square)):
+        own_sq = _squared_lengths(whitened[:, part])
+        np.subtract(track_sq.take(point_idx[part]), own_sq, out=other_sq[part])  # (3); NaN where not verified
+        np.maximum(other_sq[part], 0.0, out=other_sq[part])
     return TrackStatistics(
-        projected,
+        whitened,
         verified,
         track_length,
         other_sq,
         (2 * length - 2 - rank).take(point_idx),
         removable,
-        sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(n)),
+        sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(len(square))),
     )
 
 
 def _squared_lengths(vectors: FloatArray) -> FloatArray:
     """Squared lengths (n,) of vectors (2, n)."""
-    square = np.empty(vectors.shape[1])
-    for part in _chunks(len(square)):
-        np.multiply(vectors[0, part], vectors[0, part], out=square[part])
-        square[part] += vectors[1, part] * vectors[1, part]
-    return square
-
-
-def _whiten_in_place(
-    projected: FloatArray, verified: BoolArray, complement: FloatArray, track_sq: FloatArray, min_eigenvalue: float
-) -> FloatArray:
-    """Whiten ``projected`` (2, n), clear ``verified`` (n,) where I - H is too small; return ``track_sq`` (n,) as (3).
-
-    Arrays of the size of a model: each is written where it was read.
-    """
-    for part in _chunks(len(track_sq)):
-        smallest, x, y = _inverse_root_times(complement[:, part], projected[:, part])
-        good = verified[part] & (smallest >= min_eigenvalue)
-        verified[part] = good
-        other = np.maximum(track_sq[part] - (x * x + y * y), 0.0)  # (3)
-        projected[0, part] = np.where(good, x, np.nan)
-        projected[1, part] = np.where(good, y, np.nan)
-        track_sq[part] = np.where(good, other, np.nan)
-    return track_sq
+    x, y = vectors
+    return np.asarray(x * x + y * y)
 
 
 def _finite_columns(point_jacobian: FloatArray) -> BoolArray:
@@ -186,34 +166,50 @@ def _finite_columns(point_jacobian: FloatArray) -> BoolArray:
     return finite
 
 
-def _project_off_points(
-    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IntArray, inverse: FloatArray
+def _whiten(
+    residuals_px: FloatArray,
+    point_jacobian: FloatArray,
+    point_idx: IntArray,
+    inverse: FloatArray,
+    limits: tuple[BoolArray, float],
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Residuals (2, n) off their tracks' column spaces, I - H as (3, n) xx, xy, yy, and the sum of squares removed."""
-    n = point_idx.size
-    gradient = np.empty_like(inverse[:3])
-    product = np.empty(n)
+    """Whiten residuals (2, n), NaN where not verified; a piece at a time, so that only what is kept is of that size.
+
+    Parameters
+    ----------
+    limits : verified (n,), which is cleared where an eigenvalue of I - H is below the second
+
+    Returns
+    -------
+    tuple
+        (2, n) e; (n,) squared residuals off their tracks' column spaces; the sum of squares that this removes.
+    """
+    verified, min_eigenvalue = limits
+    gradient, square = np.empty_like(inverse[:3]), np.empty(point_idx.size)
     for axis in range(3):
-        _sum_of_two_products(point_jacobian[:, axis], residuals_px, product)
-        gradient[axis] = sum_by_point(product, point_idx, inverse.shape[1])
+        _sum_of_two_products(point_jacobian[:, axis], residuals_px, square)
+        gradient[axis] = sum_by_point(square, point_idx, inverse.shape[1])
     step = symmetric_times(inverse, gradient)  # A^+ J^T eps: where the points would move
-    projected = np.empty_like(residuals_px)
-    complement = np.empty((3, n))
+    whitened = np.empty_like(residuals_px)
     removable = 0.0
-    for part in _chunks(n):
-        idx = point_idx[part]
-        jacobian = point_jacobian[:, :, part]
+    for part in _chunks(point_idx.size):
+        idx, jacobian = point_idx[part], point_jacobian[:, :, part]
         move = step.take(idx, axis=1)
-        for row in range(2):
-            removed = _dot(jacobian[row], move)
-            removable += float(removed @ removed)
-            np.subtract(residuals_px[row, part], removed, out=projected[row, part])
-        local = inverse.take(idx, axis=1)
-        by_x, by_y = symmetric_times(local, jacobian[0]), symmetric_times(local, jacobian[1])
-        np.subtract(1.0, _dot(jacobian[0], by_x), out=complement[0, part])
-        np.negative(_dot(jacobian[1], by_x), out=complement[1, part])
-        np.subtract(1.0, _dot(jacobian[1], by_y), out=complement[2, part])
-    return projected, complement, removable
+        removed = np.stack([_dot(jacobian[row], move) for row in range(2)])
+        removable += float(removed[0] @ removed[0]) + float(removed[1] @ removed[1])
+        projected = residuals_px[:, part] - removed
+        square[part] = _squared_lengths(projected)
+        smallest, x, y = _inverse_root_times(_complement(jacobian, inverse.take(idx, axis=1)), projected)
+        good = verified[part]
+        good &= smallest >= min_eigenvalue
+        whitened[0, part], whitened[1, part] = np.where(good, x, np.nan), np.where(good, y, np.nan)
+    return whitened, square, removable
+
+
+def _complement(jacobian: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """I - H, (m,) each xx, xy, yy, of observations with (2, 3, m) and their points' inverse information (6, m)."""
+    by_x, by_y = symmetric_times(inverse, jacobian[0]), symmetric_times(inverse, jacobian[1])
+    return 1.0 - _dot(jacobian[0], by_x), -_dot(jacobian[1], by_x), 1.0 - _dot(jacobian[1], by_y)
 
 
 def _sum_of_two_products(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
@@ -260,7 +256,10 @@ def inverse_information(
     for row, (i, j) in enumerate(_SYMMETRIC):
         _sum_of_two_products(point_jacobian[:, i], point_jacobian[:, j], product)
         information[row] = sum_by_point(product, point_idx, num_points)
-    return _inverses(information)
+    rank = np.empty(num_points, dtype=np.int32)
+    for part in _chunks(num_points):
+        information[:, part], rank[part] = _inverses(information[:, part])
+    return information, rank
 
 
 def _inverses(information: FloatArray) -> tuple[FloatArray, Int32Array]:
@@ -296,8 +295,12 @@ def _inverses(information: FloatArray) -> tuple[FloatArray, Int32Array]:
     return inverse, rank
 
 
-def _inverse_root_times(matrix: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Smaller eigenvalue of symmetric 2x2 matrices (3, n), and their inverse symmetric root times vectors (2, n).
+def _inverse_root_times(
+    matrix: tuple[FloatArray, FloatArray, FloatArray], vector: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Smaller eigenvalue of symmetric 2x2 matrices, and their inverse symmetric root times vectors (2, n).
+
+    matrix : xx, xy, yy (n,) each
 
     The root of M is (M + sqrt(det) I) / sqrt(trace + 2 sqrt(det)); where M is not positive definite the result is
     meaningless and the eigenvalue says so.
