@@ -27,10 +27,8 @@ from sfm_audit.audit.schedule.runner import audit_many
 from sfm_audit.audit.schedule.task import NO_LIMITS, Failure, Limits
 from sfm_audit.loaders import Discovery, ModelRef
 from sfm_audit.reports.errors import OutputError, RunFolderError
-from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.record import INPUT_KINDS
 from sfm_audit.reports.run_folder.store import RunFailure, RunSettings, RunStore
-from sfm_audit.reports.text.summary import render_summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +108,9 @@ def print_summary(folder: Path) -> None:
     KnownError
         It holds no run that can be read.
     """
+    from sfm_audit.reports.run_folder.reader import RunReader  # noqa: PLC0415 - not with --quiet
+    from sfm_audit.reports.text.summary import render_summary  # noqa: PLC0415
+
     try:
         print_page(render_summary(RunReader.open(folder), terminal_page()))
     except RunFolderError as error:

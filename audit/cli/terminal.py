@@ -7,11 +7,12 @@ import shutil
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from sfm_audit.reports.text.drawing import Page
+if TYPE_CHECKING:
+    from sfm_audit.reports.text.drawing import Page
 
 _MIN_WIDTH: Final = 40  # narrower tables have no room for numbers
 _WIDTH: Final = 80
@@ -58,6 +59,8 @@ def print_page(text: str, *, to_stderr: bool = False) -> None:
 
 def terminal_page() -> Page:
     """Return how to draw on stdout: as wide as the terminal; elsewhere as COLUMNS says, or 80 columns."""
+    from sfm_audit.reports.text.drawing import Page  # noqa: PLC0415 - rich, for which help and errors need not wait
+
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size((_WIDTH, 24)).columns if is_terminal else _columns()
     has_colour = is_terminal and "NO_COLOR" not in os.environ
