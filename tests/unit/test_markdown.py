@@ -59,7 +59,7 @@ def test_table_rows_have_three_cells(tmp_path):
 
 def test_the_size_stays_below_what_github_shows(tmp_path, monkeypatch):
     monkeypatch.setattr("sfm_audit.reports.compare.markdown.MAX_BYTES", 20_000)
-    page = render_markdown(report(tmp_path, 30, ["東" * 300 + f"{i}" for i in range(25)]))
+    page = render_markdown(report(tmp_path, 3, ["東" * 300 + f"{i}" for i in range(25)]))
     assert len(page.encode()) <= 20_000
     assert re.search(r"\.\.\. and \d+ more lines; all of them are in the file of --json\n$", page)
     assert MAX_BYTES < 1024 * 1024
