@@ -77,14 +77,14 @@ def audit(folder: str) -> None:
     clock.lap("residuals")
     _ = auditor.consistency
     clock.lap("consistency")
-    _ = auditor.tracks
-    clock.lap("tracks, prior")
     _ = auditor.quality
     clock.lap("camera facts")
     _ = auditor.cameras
     clock.lap("cameras")
     _ = auditor.outside
     clock.lap("witnesses")
+    _ = auditor.tracks
+    clock.lap("tracks, prior")
     early_peak = peak_bytes()
     _ = auditor.joint
     clock.lap(JOINT)

@@ -338,7 +338,7 @@ class ModelAuditor:
         """Audit all images and return the tables; ``labels`` fill the text columns that name the model."""
         labels = labels or self._own_labels
         _ = self.tau_px, self.moved, self.consistency  # what all of these ask, before the images are spread
-        together(lambda: self.joint, lambda: (self.cameras, self.tracks, self.outside))
+        together(lambda: self.joint, lambda: (self.cameras, self.outside, self.tracks))  # what is kept longest, last
         _ = self.config.noise == "keypoint" and self.keypoint_tracks
         parts = self._spread(partial(audit_images, labels=labels), self)
         said = Said.together([part.said for part in parts])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Final, TypeAlias
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -13,6 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.kernels import witnesses as kernels
 from sfm_audit.loaders.arrays import BoolArray, Int32Array, IntArray
+
+_MAX_IMAGES_IN_FULL: Final = 1500  # whose pairs are counted in a full matrix: 18 MB
+_MAX_PAIRS: Final = 1 << 20  # of images that see a point, each twice, in memory at the same time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,16 +81,65 @@ def covisibility(residuals: ModelResiduals, num_points: int) -> tuple[SeenBy, Co
     found = kernels.shared_points(residuals.offsets, residuals.point_idx, num_points)
     if found is not None:
         return SeenBy(*found[0]), Covisibility(*found[1], num_images)
-    image_idx = np.repeat(np.arange(num_images, dtype=np.int32), np.diff(residuals.offsets))
-    shape = (max(num_points, 1), max(num_images, 1))
-    seen = csr_array((np.ones(len(image_idx), dtype=np.int32), (residuals.point_idx, image_idx)), shape=shape)
+    seen_by = _turned(residuals, num_points)
+    pairs = _in_full if num_images <= _MAX_IMAGES_IN_FULL else _by_product
+    return seen_by, Covisibility(*pairs(seen_by, num_images), num_images)
+
+
+def _turned(residuals: ModelResiduals, num_points: int) -> SeenBy:
+    """Sort observations by their point; those of an image that follow each other count once."""
+    num_images, num = len(residuals.offsets) - 1, len(residuals.point_idx)
+    given = np.ones(num, dtype=np.int8), residuals.point_idx.astype(np.int32), residuals.offsets.astype(np.int32)
+    by_image = csr_array(given, shape=(num_images, num_points)) if num else csr_array((num_images, num_points))
+    seen = by_image.tocsc()
     seen.sum_duplicates()
-    seen.data[:] = 1
+    return SeenBy(seen.indptr.astype(np.int64), seen.indices.astype(np.int32, copy=False))
+
+
+_Pairs: TypeAlias = tuple[IntArray, IntArray, IntArray]
+"""first < second, num_shared: (k,) each."""
+
+
+def _in_full(seen_by: SeenBy, num_images: int) -> _Pairs:
+    """Count the pairs of images of each point in a matrix of all pairs."""
+    image_idx, ends = seen_by.image_idx, seen_by.offsets[1:]
+    total = np.zeros(num_images * num_images, dtype=np.int64)
+    for points in _pieces(seen_by.offsets):
+        first, last = int(seen_by.offsets[points.start]), int(seen_by.offsets[points.stop])
+        own = image_idx[first:last].astype(np.int64)
+        at = np.arange(first, last, dtype=np.int64)
+        end = np.repeat(ends[points], np.diff(seen_by.offsets[points.start : points.stop + 1]))
+        keys = [np.empty(0, dtype=np.int64)]
+        step = 1
+        while at.size:  # pairs of an image with the step-th behind it among those that see the point
+            kept = at + step < end
+            at, end = at.compress(kept), end.compress(kept)
+            keys.append(own[at - first] * num_images + own[at + step - first])
+            step += 1
+        total += np.bincount(np.concatenate(keys), minlength=total.size)
+    found = np.flatnonzero(total)
+    return found // num_images, found % num_images, total[found]
+
+
+def _pieces(offsets: IntArray) -> Iterator[slice]:
+    """Yield consecutive points with so many pairs of images as are in memory together."""
+    num = np.diff(offsets)
+    before = np.concatenate([[0], np.cumsum(num * num)])
+    start = 0
+    while start < num.size:
+        stop = max(int(np.searchsorted(before, before[start] + _MAX_PAIRS, side="right")) - 1, start + 1)
+        yield slice(start, stop)
+        start = stop
+
+
+def _by_product(seen_by: SeenBy, num_images: int) -> _Pairs:
+    """Count the pairs of images of each point by a sparse product, where a matrix of all pairs is too large."""
+    given = np.ones(len(seen_by.image_idx), dtype=np.int32), seen_by.image_idx, seen_by.offsets
+    seen = csr_array(given, shape=(len(seen_by.offsets) - 1, num_images))
     shared = (seen.T.tocsr() @ seen).tocoo()
     upper = shared.row < shared.col
     first, second, num_shared = (each[upper].astype(np.int64) for each in (shared.row, shared.col, shared.data))
-    offsets, images = seen.indptr[: num_points + 1].astype(np.int64), seen.indices.astype(np.int32)
-    return SeenBy(offsets, images), Covisibility(first, second, num_shared, num_images)
+    return first, second, num_shared
 
 
 @dataclass(frozen=True, slots=True, eq=False)

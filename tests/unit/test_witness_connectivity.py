@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from model_writer import Camera, Image, Model, Point, write_binary
 
 from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.kernels import numpy_only
+from sfm_audit.audit.witnesses import covisibility as covisibility_of
 from sfm_audit.audit.witnesses.connectivity import ask_connectivity
 from sfm_audit.audit.witnesses.covisibility import Covisibility, cuts_of
 from sfm_audit.audit.witnesses.evidence import Evidence
@@ -115,3 +118,26 @@ def test_images_of_one_frame_hang_together(tmp_path, frames):
 def test_a_model_without_images(tmp_path):
     report = asked(open_model(write_binary(tmp_path / "m", Model((Camera(),), (), ()))))
     assert report.findings == ()
+
+
+@pytest.mark.parametrize("max_pairs", [1, 1 << 20])
+@pytest.mark.parametrize("max_images", [0, 1500])
+def test_shared_points_are_counted_in_full_and_by_a_product(monkeypatch, max_images, max_pairs):
+    monkeypatch.setattr(covisibility_of, "_MAX_IMAGES_IN_FULL", max_images)
+    monkeypatch.setattr(covisibility_of, "_MAX_PAIRS", max_pairs)
+    rng = np.random.default_rng(3)
+    sees = rng.random((12, 70)) < rng.uniform(0.0, 1.0, 70)
+    sees[4] = False
+    image, point = np.nonzero(np.concatenate([sees, sees[:, :9]], axis=1))  # points 0 .. 8 are seen twice by an image
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(image, minlength=12))])
+    with numpy_only():
+        seen, pairs = covisibility_of.covisibility(SimpleNamespace(offsets=offsets, point_idx=point % 70), 70)
+    assert [seen.image_idx[slice(*seen.offsets[p : p + 2])].tolist() for p in range(70)] == [
+        np.flatnonzero(sees[:, p]).tolist() for p in range(70)
+    ]
+    shared = np.zeros((12, 12), dtype=np.int64)
+    shared[pairs.first, pairs.second] = pairs.num_shared
+    number = sees.astype(np.int64)
+    np.testing.assert_array_equal(shared, np.triu(number @ number.T, 1))
+    assert (pairs.num_shared > 0).all()
+    assert pairs.num_images == 12
