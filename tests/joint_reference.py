@@ -88,6 +88,13 @@ def stacked(model: SparseModel, *, robust=True):
     return Stacked(columns * root[:, None], own, y * root, root, rows, residuals.point_idx)
 
 
+def in_order_of(reference, observations):
+    """The same with the rows of each image, and the points' numbers, as a system has them that all of them are in."""
+    two = (2 * observations.source[:, None] + np.arange(2)).ravel()
+    columns, y, root = reference.columns[two], reference.y[two], reference.root[two]
+    return reference._replace(columns=columns, y=y, root=root, point=observations.point_idx)
+
+
 def projector(columns):
     """Orthonormal basis of the columns' span; the gauge is not in it."""
     scale = np.linalg.norm(columns, axis=0)

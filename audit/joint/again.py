@@ -89,11 +89,13 @@ class _State:
         for camera in np.unique(layout.camera_idx[used]).tolist():
             own = int(model.cameras.param_offsets[camera]) + np.array(layout.own_param_idxs[camera], dtype=np.int64)
             params[own] += self.step[layout.own_of_camera(camera)]
+        xyz_world = model.points.xyz_world.copy()
+        xyz_world[self.observations.points] += self.point_step
         return replace(
             model,
             cameras=replace(model.cameras, params=params),
             images=replace(model.images, quat_cam_from_world_wxyz=quat, translation_cam_from_world=translation),
-            points=replace(model.points, xyz_world=model.points.xyz_world + self.point_step),
+            points=replace(model.points, xyz_world=xyz_world),
         )
 
 

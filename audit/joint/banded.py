@@ -17,6 +17,7 @@ from scipy.linalg import blas, lapack, qr
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from sfm_audit.audit.kernels.joint_parts import near_entries
+from sfm_audit.audit.kernels.joint_scores import BandArrays
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
@@ -175,6 +176,11 @@ class BandedInverse:
         out[order] = entries @ scaled[order]
         out -= null @ (pull.T @ scaled) + pull @ (null.T @ scaled)
         return np.asarray(scale * out)
+
+    def arrays(self) -> BandArrays:
+        """As compiled sums take it."""
+        band, starts = self.factor.band, _places_in_flat(self.near)
+        return BandArrays(band.place, band.width, self.flat, *starts, self.factor.null, self.pull, self.inverse_scale)
 
     def _is_near(self, columns: IntArray) -> bool:
         """Whether all entries at some columns are at hand."""

@@ -12,6 +12,7 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.joint_parts import DesignInputs, fill_design
+from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
@@ -89,9 +90,13 @@ def make_design(
     kept = np.zeros((int(ends[-1]) if ends.size else 0, 2, layout.width))
     images = np.flatnonzero(is_kept & (counts > 0))
     inverses = np.linalg.pinv(rotation_from_quat(model.images.quat_cam_from_world_wxyz[images]))  # all at once
-    for image, inverse in zip(images.tolist(), inverses, strict=True):
-        own = source[int(offsets[image]) : int(offsets[image + 1])]
-        _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, _Rows(image, own, inverse))
+
+    def fill(start: int, stop: int) -> None:
+        for image, inverse in zip(images[start:stop].tolist(), inverses[start:stop], strict=True):
+            own = source[int(offsets[image]) : int(offsets[image + 1])]
+            _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, _Rows(image, own, inverse))
+
+    over_ranges(fill, images.size, counts[images])
     return Design(model, residuals, layout, source, offsets, kept, first)
 
 

@@ -11,6 +11,7 @@ from scipy.linalg import lapack
 
 from sfm_audit.audit.joint.banded import Band, BandedFactor, band_of, banded_factor, banded_inverse
 from sfm_audit.audit.kernels.joint_parts import dense_entries
+from sfm_audit.audit.kernels.joint_scores import BandArrays
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 NULL_EIGENVALUE: Final = 1e-11  # of S with unit diagonal
@@ -50,6 +51,10 @@ class SymmetricInverse(Protocol):
         """(k, k) entries of S^+ at some columns."""
         ...
 
+    def arrays(self) -> FloatArray | BandArrays:
+        """As compiled sums take it."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DenseInverse:
@@ -72,6 +77,10 @@ class DenseInverse:
     def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
         """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
         return np.asarray(self.block(columns) @ right)
+
+    def arrays(self) -> FloatArray:
+        """S^+ (D, D) in C order, as compiled sums take it; symmetric."""
+        return self.array if self.array.flags.c_contiguous else np.ascontiguousarray(self.array.T)
 
     def rows(self, columns: IntArray) -> FloatArray:
         """(k, D) rows of S^+."""

@@ -14,7 +14,7 @@ from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_groups, untested
-from sfm_audit.audit.joint.image_scores import image_scores, sums_of_base
+from sfm_audit.audit.joint.image_scores import ScoresOfMany, image_scores, sums_of_base
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
@@ -144,6 +144,8 @@ class _Rounds:
     ) -> None:
         num_images = len(tested)
         self._system, self._base, self._sums = system, system.base, sums_of_base(system.base)
+        can = self._sums is not None and ScoresOfMany.can(self._base, self._sums)
+        self._many = ScoresOfMany(system, self._base, self._sums) if can and self._sums is not None else None
         self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
@@ -173,7 +175,7 @@ class _Rounds:
 
         def tested(start: int, stop: int) -> None:
             some = images[start:stop]
-            answers = _image_tests(self._system, some, [self._scores(image) for image in some], self._alpha)
+            answers = _image_tests(self._system, some, self._scores_of(some), self._alpha)
             for image, answer in zip(some, answers, strict=True):
                 self.tests[image], self._worth[image] = answer
 
@@ -181,6 +183,18 @@ class _Rounds:
         waiting = np.flatnonzero(self._tested & (self._round < 0))
         p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()])
         self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
+
+    def _scores_of(self, images: Sequence[int]) -> list[CandidateScores | None]:
+        """Of each image, all that its tests ask for."""
+        if self._many is None:
+            return [self._scores(image) for image in images]
+        powers = [0 if self._beside is None else self._beside.power(image) for image in images]
+        out: list[CandidateScores | None] = []
+        for image, power, found in zip(images, powers, self._many.scores(images, powers), strict=True):
+            if found is not None and power and self._beside is not None:
+                self._beside.take(image, found.only(slice(NUM_FIELDS, None)))
+            out.append(self._scores(image) if found is None else found.only(slice(0, NUM_FIELDS)))
+        return out
 
     def _scores(self, image: int) -> CandidateScores | None:
         power = 0 if self._beside is None else self._beside.power(image)
@@ -227,7 +241,7 @@ class _Rounds:
                 fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
                 candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
-        self._sums = sums_of_base(self._base)
+        self._sums, self._many = sums_of_base(self._base), None
 
     def _touched(self, new: BoolArray) -> BoolArray:
         """(I,) images that share points with any of the new ones."""

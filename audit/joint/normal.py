@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -13,8 +14,11 @@ from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, po
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.kernels.joint import JointSums
-from sfm_audit.audit.kernels.joint_parts import unit_determinants
+from sfm_audit.audit.kernels.joint_parts import two_informations, unit_determinants
+from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +38,7 @@ class ReducedSystem:
 def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
     """Assemble (6) with the robust weights and with w = 1."""
     weights = observations.weight, observations.plain_weight
-    inverses = [_point_inverse(observations, weight) for weight in weights]
+    inverses = _point_inverses(observations, weights)
     values_px = observations.residuals_px()
     sums = joint_sums(observations, values_px, weights, (inverses[0], inverses[1]))
     compiled = None if sums is None else _compiled_systems(observations, sums, inverses, values_px)
@@ -69,11 +73,7 @@ def _compiled_systems(
     """The same by the compiled sums; the others' side of a block is without T, which comes to all of them here."""
     layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
     cleaned = sums.off_points(values_px, 0)[1], sums.off_points(values_px, 1)[1]
-    found = [
-        each
-        for image in images.tolist()
-        if (each := sums.normal(image, observations.transform[image], cleaned)) is not None
-    ]
+    found = _of_images(observations, lambda image: sums.normal(image, observations.transform[image], cleaned))
     if not found or len(found) < images.size:
         return None
     pairs = np.repeat(np.arange(images.size), [each.around.size for each in found])
@@ -92,6 +92,17 @@ def _compiled_systems(
         matrix = _symmetric(layout.num_columns, layout.columns[around], own_columns[pairs], slabs)
         systems.append(ReducedSystem(inverse, matrix, right[:-1], before[:-1]))
     return systems[0], systems[1]
+
+
+def _of_images(observations: JointObservations, compiled: Callable[[int], T | None]) -> list[T]:
+    """What a kernel says of the images with columns and observations, those of which it says nothing left out."""
+    images = observations.used_images
+
+    def some(start: int, stop: int) -> list[T]:
+        return [each for image in images[start:stop] if (each := compiled(image)) is not None]
+
+    counts = np.diff(observations.offsets)[images]
+    return [each for part in over_ranges(some, len(images), counts) for each in part]
 
 
 def _symmetric(num_columns: int, rows: IntArray, columns: IntArray, blocks: FloatArray) -> sparse.csr_array:
@@ -177,7 +188,7 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
 
 def _compiled_meat(observations: JointObservations, sums: JointSums) -> sparse.csr_array | None:
     layout, transform, images = observations.layout, observations.transform, observations.used_images
-    found = [each for image in images if (each := sums.meat(image, transform[image])) is not None]
+    found = _of_images(observations, lambda image: sums.meat(image, transform[image]))
     if not found or len(found) < len(images):
         return None
     own = np.repeat(images, [around.size for around, _ in found]).astype(np.int64)
@@ -214,20 +225,29 @@ def point_steps(
     return np.asarray(np.einsum("pij,pj->pi", point_inverse, pull))
 
 
-def _point_inverse(observations: JointObservations, weight: FloatArray) -> FloatArray:
+def _point_inverses(observations: JointObservations, weights: tuple[FloatArray, FloatArray]) -> list[FloatArray]:
+    """V^-1 (P, 3, 3) with either weight."""
     if observations.points_independent:
-        return np.zeros((observations.num_points, 3, 3))
+        return [np.zeros((observations.num_points, 3, 3)) for _ in weights]
+    kept = observations.design.kept
+    compiled = two_informations(kept, weights, observations.point_idx, observations.num_points)
+    informations = compiled or (_information(observations, weight) for weight in weights)
+    return [_inverted(information) for information in informations]
+
+
+def _information(observations: JointObservations, weight: FloatArray) -> FloatArray:
     everywhere = np.zeros(observations.residuals.point_idx.size)
     everywhere[observations.source] = weight
-    information = point_information(
-        observations.residuals.point_jacobian, everywhere, observations.residuals.point_idx, observations.num_points
-    )
-    del everywhere
+    jacobian, point_idx = observations.residuals.point_jacobian, observations.residuals.point_idx
+    return point_information(jacobian, everywhere, point_idx, len(observations.model.points))[observations.points]
+
+
+def _inverted(information: FloatArray) -> FloatArray:
+    """In place."""
     if unit_determinants(information, smallest=0.0, invert=True) is not None:
         return information
-    seen = np.flatnonzero(np.diff(observations.point_offsets) > 0)
-    for start in range(0, seen.size, AT_ONCE):  # in place: what nobody sees is zero, and stays so
-        part = seen[start : start + AT_ONCE]
+    for start in range(0, len(information), AT_ONCE):
+        part = slice(start, start + AT_ONCE)
         scale = np.sqrt(np.einsum("pii->pi", information[part]))
         unit = information[part] / scale[:, :, None] / scale[:, None, :]
         information[part] = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]

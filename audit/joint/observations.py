@@ -13,7 +13,7 @@ from sfm_audit.audit.joint.design import AT_ONCE, EVERY, PART, POINT, Design, ma
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
 from sfm_audit.audit.kernels import joint_parts as kernels
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 MIN_INLIERS: Final = 20
 _HUBER: Final = 2.5  # sigma from which on an observation loses weight
@@ -24,11 +24,15 @@ _MIN_VIEWS: Final = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointObservations:
-    """The n observations of the system by image, in the order of ModelResiduals; C = ``layout.width``.
+    """The n observations of the system by image; C = ``layout.width``.
+
+    Points are numbered in the order in which images first see them, and an image's observations follow that order:
+    whoever goes through an image finds what it needs nearly in one piece.
 
     model, residuals: where they come from.
     offsets: (I + 1,) image i owns rows offsets[i]:offsets[i + 1].    source: (n,) columns of ModelResiduals.
-    image_idx: (n,).    point_idx: (n,) rows of PointTable; of an independent point, the observation itself.
+    image_idx: (n,).    points: (P,) rows of PointTable.    point_idx: (n,) places in ``points``; independent points
+    have one for each observation.
     design: (n, 2, C) see `Design`.
     transform: (I, C, C) T of each image: N = design T. A translation in the camera's axes moves a pixel as one in the
     world's axes moves it, turned, so that nothing is stored twice.
@@ -44,6 +48,7 @@ class JointObservations:
     offsets: IntArray
     source: IntArray
     image_idx: IntArray
+    points: IntArray
     point_idx: IntArray
     design: Design
     transform: FloatArray
@@ -56,7 +61,7 @@ class JointObservations:
 
     @property
     def num_points(self) -> int:
-        """Rows of per-point arrays, points without observations included."""
+        """P: rows of per-point arrays."""
         return len(self.point_offsets) - 1
 
     @property
@@ -138,9 +143,8 @@ def joint_observations(
     views left or with a singular V (two rays that are parallel) are left out with their observations.
     """
     counts = np.diff(residuals.offsets)
-    used = usable_images(model, residuals, sigma_px)
+    used = usable_images(model, residuals, sigma_px) & _finite_images(residuals)
     used &= ~left_out if left_out is not None else True
-    used &= _finite_images(residuals)
     weight = _weights(residuals, np.where(used, sigma_px, np.nan), counts)
     in_use = np.repeat(used, counts)
     if not points_independent:
@@ -149,9 +153,11 @@ def joint_observations(
     source = np.flatnonzero(in_use)
     image_idx = np.repeat(np.arange(len(counts)), counts)[source]
     offsets = np.searchsorted(image_idx, np.arange(len(counts) + 1)).astype(np.int64)
-    point_idx = np.arange(source.size) if points_independent else residuals.point_idx[source]
-    num_points = source.size if points_independent else len(model.points)
-    by_point, point_offsets = _by_point(point_idx, num_points)
+    seen = residuals.point_idx[source]
+    sight = (
+        _each_by_itself(seen) if points_independent else _in_order_of_sight(image_idx, seen, offsets, len(model.points))
+    )
+    source = source[sight.order]
     return JointObservations(
         model,
         residuals,
@@ -159,32 +165,44 @@ def joint_observations(
         offsets,
         source,
         image_idx,
-        point_idx,
+        sight.points,
+        sight.point_idx,
         make_design(model, residuals, layout, source, offsets),
         _transforms(model, layout),
         weight[source],
         sigma_px,
         _rms_px(residuals, counts),
-        by_point,
-        point_offsets,
+        sight.by_point,
+        sight.point_offsets,
         points_independent,
     )
 
 
-def _by_point(point_idx: IntArray, num_points: int) -> tuple[IntArray, IntArray]:
-    """(n,) rows by point, then in order, and (P + 1,) where each point begins."""
-    compiled = kernels.rows_by_point(point_idx, num_points)
+def _each_by_itself(point_idx: IntArray) -> kernels.Sight:
+    """Observations of independent points."""
+    rows = np.arange(point_idx.size)
+    return kernels.Sight(point_idx, rows, rows, rows, np.arange(point_idx.size + 1))
+
+
+def _in_order_of_sight(image_idx: IntArray, point_idx: IntArray, offsets: IntArray, num_points: int) -> kernels.Sight:
+    compiled = kernels.in_order_of_sight(image_idx, point_idx, offsets, num_points)
     if compiled is not None:
         return compiled
-    ends = np.cumsum(np.bincount(point_idx, minlength=num_points))
-    return np.argsort(point_idx, kind="stable").astype(np.int64), np.concatenate([[0], ends]).astype(np.int64)
+    seen, first = np.unique(point_idx, return_index=True)
+    points = seen[np.argsort(first)]
+    number = np.zeros(num_points, dtype=np.int64)
+    number[points] = np.arange(points.size)
+    order = np.lexsort((number[point_idx], image_idx))
+    place = number[point_idx[order]]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=points.size))]).astype(np.int64)
+    return kernels.Sight(points, order, place, np.argsort(place, kind="stable"), starts)
 
 
 def _transforms(model: SparseModel, layout: Layout) -> FloatArray:
     """(I, C, C) T: d / d translation of the camera = J R^-1, then from the frame's pose to the image's."""
     out = np.tile(np.eye(layout.width), (len(model.images), 1, 1))
-    for image in np.flatnonzero(layout.has_columns).tolist():
-        out[image, POINT, POINT] = np.linalg.pinv(model.image(image).rotation_cam_from_world)
+    images = np.flatnonzero(layout.has_columns)
+    out[images, POINT, POINT] = np.linalg.pinv(rotation_from_quat(model.images.quat_cam_from_world_wxyz[images]))
     out[:, :NUM_POSE, :NUM_POSE] = out[:, :NUM_POSE, :NUM_POSE] @ layout.image_from_frame
     return out
 

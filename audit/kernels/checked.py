@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 SmallIntArray: TypeAlias = NDArray[np.int32]
 
@@ -38,3 +38,27 @@ def doubles(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     if out.shape != shape:
         raise ValueError(f"expected an array of shape {shape}, found {out.shape}")
     return out
+
+
+def first_views(held: dict[str, Any]) -> BoolArray:
+    """Return (n,) whether no earlier row of the image shows the same point; rows of a point are in order."""
+    by_point, image = held["by_point"], held["image_of"]
+    again = np.zeros(by_point.size, dtype=bool)
+    point = held["point_idx"].take(by_point)
+    again[1:] = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
+    out = np.ones(by_point.size, dtype=bool)
+    out[by_point[again]] = False
+    return out
+
+
+def check_indices(held: dict[str, Any], num_images: int, num_points: int) -> None:
+    """Raise ValueError where indices of a joint system lead outside: C follows them without looking."""
+    num_rows = len(held["image_idx"])
+    for name, limit in (("image_idx", num_images), ("point_idx", num_points), ("by_point", num_rows)):
+        values = held[name]
+        if values.size and not (values.min() >= 0 and values.max() < limit):
+            raise ValueError(f"{name}: expected 0 .. {limit - 1}, found {values.min()} .. {values.max()}")
+    for name in ("offsets", "point_offsets"):
+        ends = held[name]
+        if ends[0] != 0 or ends[-1] != num_rows or (np.diff(ends) < 0).any():
+            raise ValueError(f"{name}: expected to rise from 0 to {num_rows}")

@@ -8,9 +8,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.checked import SmallIntArray, doubles, ints, small_ints
+from sfm_audit.audit.kernels.checked import SmallIntArray, check_indices, doubles, first_views, ints, small_ints
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel, library
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 SCALAR: Final = 16
 """Scalar functions of a field along one axis: 1, the fourteen monomials, padding."""
@@ -141,7 +141,7 @@ class JointSums:
             "extra_width": width,
             "extra": extra,
         }
-        _check_indices(held, num_images, num_points)
+        check_indices(held, num_images, num_points)
         held["image_of"] = held["image_idx"].take(held["by_point"])
         self._held = held
         self._widths = arrays.design.shape[2] + width
@@ -150,8 +150,40 @@ class JointSums:
         self._model.held = held  # whoever keeps the addresses keeps the arrays
         self._num_images = num_images
         views = np.diff(held["point_offsets"])[held["point_idx"]]
-        self._is_first = _first_views(held)
+        self._is_first = first_views(held)
         self._num_views = np.diff(np.concatenate([[0], np.cumsum(views)])[held["offsets"]])
+
+    @property
+    def num_images(self) -> int:
+        """Of images."""
+        return self._num_images
+
+    @property
+    def num_points(self) -> int:
+        """Of points."""
+        return len(self._held["point_inverse"])
+
+    @property
+    def num_rows(self) -> int:
+        """Of observations."""
+        return len(self._held["weight"])
+
+    @property
+    def model(self) -> ctypes.Structure:
+        """`joint_model`; it keeps its arrays."""
+        return self._model
+
+    @property
+    def repeats_follow(self) -> bool:
+        """Whether rows of an image that show one point follow each other."""
+        point, image = self._held["point_idx"], self._held["image_idx"]
+        again = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
+        return bool(np.count_nonzero(again) == np.count_nonzero(~self._is_first))
+
+    def most_of(self, images: IntArray) -> tuple[int, int]:
+        """Return the most rows, and the most views of points, that one of the images has."""
+        counts = np.diff(self._held["offsets"])[images]
+        return int(counts.max(initial=0)), int(self._num_views[images].max(initial=0))
 
     def can(self, image_idx: int) -> bool:
         """Whether the views of an image's points are few enough to be held at once."""
@@ -352,27 +384,3 @@ class JointSums:
 def has_joint_kernels() -> bool:
     """Whether the sums come from the compiled library."""
     return library() is not None
-
-
-def _first_views(held: dict[str, Any]) -> BoolArray:
-    """(n,) whether no earlier row of the image shows the same point; rows of a point are in order."""
-    by_point, image = held["by_point"], held["image_of"]
-    again = np.zeros(by_point.size, dtype=bool)
-    point = held["point_idx"].take(by_point)
-    again[1:] = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
-    out = np.ones(by_point.size, dtype=bool)
-    out[by_point[again]] = False
-    return out
-
-
-def _check_indices(held: dict[str, Any], num_images: int, num_points: int) -> None:
-    """C follows them without looking."""
-    num_rows = len(held["image_idx"])
-    for name, limit in (("image_idx", num_images), ("point_idx", num_points), ("by_point", num_rows)):
-        values = held[name]
-        if values.size and not (values.min() >= 0 and values.max() < limit):
-            raise ValueError(f"{name}: expected 0 .. {limit - 1}, found {values.min()} .. {values.max()}")
-    for name in ("offsets", "point_offsets"):
-        ends = held[name]
-        if ends[0] != 0 or ends[-1] != num_rows or (np.diff(ends) < 0).any():
-            raise ValueError(f"{name}: expected to rise from 0 to {num_rows}")

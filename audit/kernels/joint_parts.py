@@ -95,14 +95,48 @@ def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) ->
     return out
 
 
-def rows_by_point(point_idx: IntArray, num_points: int) -> tuple[IntArray, IntArray] | None:
-    """(n,) rows by point, then in order, and (P + 1,) where each point begins; None for the numpy path."""
-    function = kernel("joint_by_point", Size, Size, Ints, Ints, Ints)
-    if function is None or point_idx.dtype != np.int64:
+class Sight(NamedTuple):
+    """Points in the order in which images first see them, and each image's rows in that order.
+
+    points: (Q,) those that are seen.    order: (n,) former row of each row.    point_idx: (n,) places in ``points``.
+    by_point: (n,) rows by point, then in order; point_offsets: (Q + 1,) where each point's begin.
+    """
+
+    points: IntArray
+    order: IntArray
+    point_idx: IntArray
+    by_point: IntArray
+    point_offsets: IntArray
+
+
+def in_order_of_sight(image_idx: IntArray, point_idx: IntArray, offsets: IntArray, num_points: int) -> Sight | None:
+    """Return the order of rows (n,) by image, ``offsets`` (I + 1,); None for the numpy path."""
+    function = kernel("joint_by_sight", Size, Size, Size, *([Ints] * 9))
+    n, num_images = point_idx.size, len(offsets) - 1
+    if function is None or image_idx.shape != (n,) or offsets[-1] != n:
         return None
-    by_point, offsets = np.empty(point_idx.size, dtype=np.int64), np.empty(num_points + 1, dtype=np.int64)
-    status = function(point_idx.size, num_points, np.ascontiguousarray(point_idx), by_point, offsets)
-    return (by_point, offsets) if status == _DONE else None
+    given = (np.ascontiguousarray(values, dtype=np.int64) for values in (image_idx, point_idx))
+    ends, number, points = offsets[:-1].astype(np.int64), *np.empty((2, num_points), dtype=np.int64)
+    order, new_idx, by_point = np.empty((3, n), dtype=np.int64)
+    starts = np.empty(num_points + 1, dtype=np.int64)
+    count = function(n, num_images, num_points, *given, ends, number, points, order, new_idx, by_point, starts)
+    if count < 0 or not np.array_equal(ends, offsets[1:]):
+        return None
+    return Sight(points[:count].copy(), order, new_idx, by_point, starts[: count + 1].copy())
+
+
+def two_informations(
+    design: FloatArray, weights: tuple[FloatArray, FloatArray], point_idx: IntArray, num_points: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """V (P, 3, 3) with either weight (n,), of the design (n, 2, C); None for the numpy path."""
+    function = kernel("joint_two_informations", Size, Size, Size, Doubles, Doubles, Doubles, Ints, Doubles, Doubles)
+    n = point_idx.size
+    if function is None or design.shape[:2] != (n, 2) or any(weight.shape != (n,) for weight in weights):
+        return None
+    out = np.empty((num_points, 3, 3)), np.empty((num_points, 3, 3))
+    given = (np.ascontiguousarray(values) for values in (design, *weights))
+    index = np.ascontiguousarray(point_idx, dtype=np.int64)
+    return out if function(n, design.shape[2], num_points, *given, index, *out) == _DONE else None
 
 
 def near_entries(

@@ -85,6 +85,8 @@ def over_ranges(
 def together(first: Callable[[], object], second: Callable[[], object]) -> None:
     """Call both, at the same time where two threads may work; neither may need what the other computes.
 
+    Each of them may have as many threads as the caller: while one has Python's lock, kernels of the other go on.
+
     Whoever interrupts the first does not wait for the second: its thread ends with the process.
     """
     if num_threads() <= 1:
@@ -99,10 +101,10 @@ def together(first: Callable[[], object], second: Callable[[], object]) -> None:
         except BaseException as error:  # noqa: BLE001 - raised again below
             errors.append(error)
 
-    thread = threading.Thread(target=_context_of_one().run, args=(keeping_errors,), name="sfm-audit", daemon=True)
+    thread = threading.Thread(target=copy_context().run, args=(keeping_errors,), name="sfm-audit", daemon=True)
     thread.start()
     try:
-        _context_of_one().run(first)
+        first()
     except Exception:
         thread.join()
         raise

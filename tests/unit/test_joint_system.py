@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from joint_reference import SPEC, model_of, projector, solved, stacked, system_of, with_param, with_poses
+from joint_reference import SPEC, in_order_of, model_of, projector, solved, stacked, system_of, with_param, with_poses
 from numpy.testing import assert_allclose
 from scipy import sparse, stats
 from scipy.spatial.transform import Rotation
@@ -49,8 +49,8 @@ def system(model):
 
 
 @pytest.fixture(scope="module")
-def reference(model):
-    return stacked(model)
+def reference(model, system):
+    return in_order_of(stacked(model), system.observations)
 
 
 def fields_of(system, image):
@@ -316,7 +316,8 @@ def test_frames_move_their_images_together():
             for _ in frame
         ]
     )
-    system, reference = system_of(model, frame_idx=frame, image_from_frame=transforms), stacked(model)
+    system = system_of(model, frame_idx=frame, image_from_frame=transforms)
+    reference = in_order_of(stacked(model), system.observations)
     fold = np.zeros((48, 24))
     for i in range(8):
         fold[6 * i : 6 * i + 6, 6 * frame[i] : 6 * frame[i] + 6] = transforms[i]

@@ -1,31 +1,7 @@
 /* The sums of the joint system (docs/method.md sections 11 and 11b; audit/joint/normal.py and candidates.py are the numpy
  * twins). An image's points and everybody who sees them are gone through image by image, so that what is added to stays
  * in the first cache. */
-#include "kernel.h"
-
-typedef double wide __attribute__((vector_size(32), aligned(8), may_alias));
-
-enum { LANES = 4, SCALAR = 16, DENSE = 12, FIELDS = 2 * SCALAR + DENSE, ROWS = 8, MOST_COLUMNS = 32, AHEAD = 8 };
-
-#define LOAD(address) (*(const wide *)(address))
-#define STORE(address) (*(wide *)(address))
-
-/* The model as JointObservations holds it. Arrays are C-contiguous; the Python module has checked all indices. */
-typedef struct {
-    int64_t num_images, width;
-    const int64_t *offsets, *point_offsets;
-    const int32_t *image_idx, *point_idx, *by_point;
-    const int32_t *image_of;     /* (n) in the order of by_point */
-    const double *design;        /* (n, 2, width) */
-    const double *weight;        /* (n) */
-    const double *other_weight;  /* (n) of the second system, see joint_normal */
-    const double *left;          /* (n, 2) */
-    const double *point_inverse; /* (P, 3, 3) */
-    const double *other_inverse; /* (P, 3, 3) */
-    const int64_t *extra_first;  /* (I) first number in extra, -1 without included fields */
-    const int64_t *extra_width;  /* (I) */
-    const double *extra;         /* per image (n_i, 2, r) */
-} joint_model;
+#include "joint.h"
 
 /* Who sees the points of an image: views (v) by image, which row of the image's own shows the point, who they are. */
 typedef struct {

@@ -114,16 +114,62 @@ KERNEL int64_t joint_design(
     return DONE;
 }
 
-/* by_point (n): rows by point, each point's in order; offsets (num_points + 1): where a point begins. */
-KERNEL int64_t joint_by_point(int64_t n, int64_t num_points, const int64_t *point_idx, int64_t *by_point, int64_t *offsets) {
+/* Points in the order in which the images first see them, and each image's rows in that order: what is asked for together
+ * lies together.
+ *
+ * image_idx, point_idx (n): rows by image.    ends (num_images): where each image's rows begin, its end afterwards.
+ * number (num_points): room.    Out: points (num_points): the first of them are the points that are seen; order (n): old row
+ * of each new one; new_idx (n): its point's place in points; by_point (n): new rows by point, each point's in order; offsets
+ * (num_points + 1): where each point's begin, for those that are seen.    Returns how many are seen, or -1. */
+KERNEL int64_t joint_by_sight(
+    int64_t n, int64_t num_images, int64_t num_points, const int64_t *image_idx, const int64_t *point_idx, int64_t *ends,
+    int64_t *number, int64_t *points, int64_t *order, int64_t *new_idx, int64_t *by_point, int64_t *offsets) {
+    int64_t count = 0;
+    for (int64_t row = 0; row < n; row++) {
+        if (point_idx[row] < 0 || point_idx[row] >= num_points || image_idx[row] < 0 || image_idx[row] >= num_images) return -1;
+    }
+    for (int64_t point = 0; point < num_points; point++) number[point] = -1;
+    for (int64_t row = 0; row < n; row++) {
+        int64_t point = point_idx[row];
+        if (number[point] < 0) offsets[count] = 0, points[count] = point, number[point] = count++;
+        offsets[number[point]]++;
+    }
+    for (int64_t k = 0, total = 0; k <= count; k++) {
+        int64_t here = k < count ? offsets[k] : 0;
+        offsets[k] = total, total += here;
+    }
+    for (int64_t row = 0; row < n; row++) by_point[offsets[number[point_idx[row]]]++] = row;
+    for (int64_t k = count; k > 0; k--) offsets[k] = offsets[k - 1];
+    offsets[0] = 0;
+    for (int64_t k = 0; k < count; k++) {
+        for (int64_t j = offsets[k]; j < offsets[k + 1]; j++) {
+            int64_t row = by_point[j], here = ends[image_idx[row]]++;
+            order[here] = row, new_idx[here] = k, by_point[j] = here;
+        }
+    }
+    return count;
+}
+
+/* V (P, 3, 3) of joint_information with two weights at once, of the design's columns. */
+KERNEL int64_t joint_two_informations(
+    int64_t n, int64_t width, int64_t num_points, const double *design, const double *weight, const double *other_weight,
+    const int64_t *point_idx, double *out, double *other) {
+    memset(out, 0, (size_t)(9 * num_points) * sizeof *out);
+    memset(other, 0, (size_t)(9 * num_points) * sizeof *other);
     for (int64_t row = 0; row < n; row++) {
         if (point_idx[row] < 0 || point_idx[row] >= num_points) return NEEDS_NUMPY;
+        const double *x = design + row * 2 * width + 3, *y = x + width;
+        double w = weight[row], u = other_weight[row], *v = out + 9 * point_idx[row], *p = other + 9 * point_idx[row];
+        for (int i = 0; i < 3; i++) {
+            for (int j = i; j < 3; j++) {
+                double both = x[i] * x[j] + y[i] * y[j];
+                v[3 * i + j] += w * both, p[3 * i + j] += u * both;
+            }
+        }
     }
-    memset(offsets, 0, (size_t)(num_points + 1) * sizeof *offsets);
-    for (int64_t row = 0; row < n; row++) offsets[point_idx[row] + 1]++;
-    for (int64_t point = 0; point < num_points; point++) offsets[point + 1] += offsets[point];
-    for (int64_t row = 0; row < n; row++) by_point[offsets[point_idx[row]]++] = row;
-    for (int64_t point = num_points; point > 0; point--) offsets[point] = offsets[point - 1];
-    offsets[0] = 0;
+    for (int64_t k = 0; k < 2 * num_points; k++) {
+        double *v = k < num_points ? out + 9 * k : other + 9 * (k - num_points);
+        v[3] = v[1], v[6] = v[2], v[7] = v[5];
+    }
     return DONE;
 }

@@ -1,0 +1,301 @@
+/* The scores of the candidate fields of images, one after the other, from the points to what the tests need (docs/method.md
+ * section 11b; audit/joint/image_scores.py). */
+#include "joint.h"
+
+enum { TILE = 16, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64 };
+
+/* S^+ (size, size) of the base: dense, or X of a band by places, D^-1 (X - G H^T - H G^T) D^-1 (audit/joint/banded.py). */
+typedef struct {
+    int64_t size, width;       /* width of an image's columns */
+    const int64_t *columns;    /* (I, width); `size` where an image has none */
+    const double *transform;   /* (I, width, width) */
+    const double *dense;       /* NULL: banded */
+    int64_t band_width, num_blocks, num_null;
+    const int64_t *place;      /* (size) of each column */
+    const int64_t *starts, *block_columns;
+    const double *near, *null, *pull, *scale;
+} base_inverse;
+
+/* Where the points, and what was observed, are found. */
+typedef struct {
+    const double *xyz, *observed, *residuals; /* (.., 3), (.., 2), (2, num_residuals) */
+    const int64_t *points, *source;           /* (P) rows of xyz, (n) columns of residuals */
+    const int32_t *observation_row;           /* (num_residuals) rows of observed */
+    int64_t num_residuals;
+} seen_points;
+
+typedef struct {
+    int64_t key, row;
+} keyed;
+
+static int by_key(const void *left, const void *right) {
+    const keyed *a = left, *b = right;
+    return a->key != b->key ? (a->key > b->key) - (a->key < b->key) : (a->row > b->row) - (a->row < b->row);
+}
+
+/* out (FIELDS) += x times from. */
+INLINE void add_row(double *out, double x, const double *from) {
+    wide f = {x, x, x, x};
+    for (int v = 0; v < VECTORS; v++) STORE(out + LANES * v) += f * LOAD(from + LANES * v);
+}
+
+/* out (rows, FIELDS) += entries (rows, TILE) times from (columns, FIELDS). */
+INLINE void add_product(int64_t rows, int64_t columns, const double *entries, const double *from, double *out) {
+    for (int64_t i = 0; i < rows; i++) {
+        wide sum[VECTORS];
+        for (int v = 0; v < VECTORS; v++) sum[v] = LOAD(out + FIELDS * i + LANES * v);
+        for (int64_t j = 0; j < columns; j++) {
+            double x = entries[TILE * i + j];
+            wide f = {x, x, x, x};
+            for (int v = 0; v < VECTORS; v++) sum[v] += f * LOAD(from + FIELDS * j + LANES * v);
+        }
+        for (int v = 0; v < VECTORS; v++) STORE(out + FIELDS * i + LANES * v) = sum[v];
+    }
+}
+
+/* Entries of X at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. */
+INLINE int entries_of(
+    const base_inverse *s, const keyed *key, int64_t first_row, int64_t rows, int64_t first_column, int64_t columns, double *out) {
+    for (int64_t i = 0; i < rows; i++) {
+        int64_t place = key[first_row + i].key, origin = 0;
+        const double *row;
+        if (s->dense) {
+            row = s->dense + place * s->size;
+        } else {
+            int64_t block = place / s->band_width;
+            origin = block * s->band_width;
+            if (key[first_column + columns - 1].key - origin >= s->block_columns[block]) return 0;
+            row = s->near + s->starts[block] + (place - origin) * s->block_columns[block];
+        }
+        for (int64_t j = 0; j < columns; j++) {
+            int64_t other = key[first_column + j].key;
+            out[TILE * i + j] = other >= place ? row[other - origin] : 0.0;
+        }
+    }
+    return 1;
+}
+
+/* out (num, FIELDS) = S^+ at the keys times from (num, FIELDS); scaled (num, FIELDS): room. 0 where entries are not at hand. */
+static inline __attribute__((always_inline)) int times_inverse(
+    const base_inverse *s, const keyed *key, const int64_t *column, int64_t num, const double *from, double *scaled, double *out) {
+    for (int64_t i = 0; i < num; i++) {
+        double d = s->dense ? 1.0 : s->scale[column[i]];
+        for (int c = 0; c < FIELDS; c++) scaled[FIELDS * i + c] = d * from[FIELDS * i + c];
+    }
+    memset(out, 0, (size_t)(num * FIELDS) * sizeof *out);
+    for (int64_t i = 0; i < num; i += TILE) {
+        int64_t rows = num - i < TILE ? num - i : TILE;
+        for (int64_t j = i; j < num; j += TILE) {
+            double tile[TILE * TILE], turned[TILE * TILE];
+            int64_t columns = num - j < TILE ? num - j : TILE;
+            if (!entries_of(s, key, i, rows, j, columns, tile)) return 0;
+            if (i == j) {
+                for (int64_t a = 0; a < rows; a++) {
+                    for (int64_t b = 0; b < a; b++) tile[TILE * a + b] = tile[TILE * b + a];
+                }
+            } else {
+                for (int64_t a = 0; a < rows; a++) {
+                    for (int64_t b = 0; b < columns; b++) turned[TILE * b + a] = tile[TILE * a + b];
+                }
+                add_product(columns, rows, turned, scaled + FIELDS * i, out + FIELDS * j);
+            }
+            add_product(rows, columns, tile, scaled + FIELDS * j, out + FIELDS * i);
+        }
+    }
+    if (s->dense) return 1;
+    for (int64_t k = 0; k < s->num_null; k++) {
+        double of_null[FIELDS] = {0.0}, of_pull[FIELDS] = {0.0};
+        for (int64_t i = 0; i < num; i++) {
+            add_row(of_null, s->null[key[i].key * s->num_null + k], scaled + FIELDS * i);
+            add_row(of_pull, s->pull[key[i].key * s->num_null + k], scaled + FIELDS * i);
+        }
+        for (int64_t i = 0; i < num; i++) {
+            add_row(out + FIELDS * i, -s->null[key[i].key * s->num_null + k], of_pull);
+            add_row(out + FIELDS * i, -s->pull[key[i].key * s->num_null + k], of_null);
+        }
+    }
+    for (int64_t i = 0; i < num; i++) {
+        for (int c = 0; c < FIELDS; c++) out[FIELDS * i + c] *= s->scale[column[i]];
+    }
+    return 1;
+}
+
+/* out (FIELDS, FIELDS) += sign times left^T right, both (num, FIELDS). */
+INLINE void add_products(int64_t num, const double *left, const double *right, double sign, double *out) {
+    for (int64_t first = 0; first < num; first += TRACKS_AT_ONCE) {
+        int64_t last = first + TRACKS_AT_ONCE < num ? first + TRACKS_AT_ONCE : num;
+        for (int64_t a = 0; a < FIELDS; a++) {
+            wide sum[VECTORS] = {{0}};
+            for (int64_t t = first; t < last; t++) {
+                double x = left[FIELDS * t + a];
+                wide f = {x, x, x, x};
+                for (int v = 0; v < VECTORS; v++) sum[v] += f * LOAD(right + FIELDS * t + LANES * v);
+            }
+            wide by = {sign, sign, sign, sign};
+            for (int v = 0; v < VECTORS; v++) STORE(out + FIELDS * a + LANES * v) += by * sum[v];
+        }
+    }
+}
+
+/* Room for one image after the other: most rows, views, columns of images around. */
+typedef struct {
+    int64_t most_rows, most_views, most_columns;
+    double *xyz, *predicted, *scalar, *dense, *absorbing, *track_score, *scores;
+    double *right, *ordered, *scaled, *solution, *moved;
+    int32_t *view, *own, *track;
+    int64_t *place, *around, *start, *column, *position;
+    keyed *keys;
+} workspace;
+
+static int has_room(workspace *w, int64_t num_images, int64_t width) {
+    int64_t n = w->most_rows, v = w->most_views, c = w->most_columns;
+    w->xyz = malloc((size_t)(n * (3 + 2 + SCALAR + 2 * DENSE + 6 + FIELDS) + 1) * sizeof(double));
+    w->scores = malloc((size_t)(v * width + 1) * sizeof(double));
+    w->right = malloc((size_t)(5 * c * FIELDS + 1) * sizeof(double));
+    w->view = malloc((size_t)(2 * v + n + 1) * sizeof(int32_t));
+    w->place = calloc((size_t)(num_images + 1), sizeof(int64_t));
+    w->around = malloc((size_t)(v + v + 1 + 2 * c + 1) * sizeof(int64_t));
+    w->keys = malloc((size_t)(c + 1) * sizeof(keyed));
+    if (!w->xyz || !w->scores || !w->right || !w->view || !w->place || !w->around || !w->keys) return 0;
+    w->predicted = w->xyz + 3 * n, w->scalar = w->predicted + 2 * n, w->dense = w->scalar + SCALAR * n;
+    w->absorbing = w->dense + 2 * DENSE * n, w->track_score = w->absorbing + 6 * n;
+    w->ordered = w->right + c * FIELDS, w->scaled = w->ordered + c * FIELDS, w->solution = w->scaled + c * FIELDS;
+    w->moved = w->solution + c * FIELDS;
+    w->own = w->view + v, w->track = w->own + v;
+    w->start = w->around + v, w->column = w->start + v + 1, w->position = w->column + c;
+    return 1;
+}
+
+static void leave(workspace *w) {
+    free(w->xyz), free(w->scores), free(w->right), free(w->view), free(w->place), free(w->around), free(w->keys);
+}
+
+/* Which distinct point each row shows, -1 - t where the row before it shows it too; returns how many there are. */
+static int64_t number_tracks(const joint_model *m, int64_t first, int64_t n, int32_t *track) {
+    int64_t count = 0;
+    for (int64_t i = 0; i < n; i++) {
+        int again = i && m->point_idx[first + i] == m->point_idx[first + i - 1];
+        track[i] = (int32_t)(again ? -count : count);
+        count += !again;
+    }
+    return count;
+}
+
+/* Order the columns around an image: keys ascending, column (num) of each; position (rows) of each row of right, -1 without
+ * a column. Returns how many distinct columns there are. */
+static int64_t order_columns(const base_inverse *s, const workspace *w, int64_t num_around) {
+    int64_t rows = 0, count = 0;
+    for (int64_t k = 0; k < num_around; k++) {
+        for (int64_t c = 0; c < s->width; c++) {
+            int64_t column = s->columns[w->around[k] * s->width + c], row = k * s->width + c;
+            w->position[row] = -1;
+            if (column < s->size) w->keys[rows++] = (keyed){s->dense ? column : s->place[column], row};
+        }
+    }
+    qsort(w->keys, (size_t)rows, sizeof *w->keys, by_key);
+    for (int64_t r = 0; r < rows; r++) {
+        keyed here = w->keys[r];
+        if (!count || w->keys[count - 1].key != here.key) {
+            w->column[count] = s->columns[w->around[here.row / s->width] * s->width + here.row % s->width];
+            w->keys[count++] = here;
+        }
+        w->position[here.row] = count - 1;
+    }
+    return count;
+}
+
+/* ordered (num, FIELDS): T^T right of each image around, summed by column. */
+INLINE void collect_columns(const base_inverse *s, const workspace *w, int64_t num_around, int64_t num) {
+    memset(w->ordered, 0, (size_t)(num * FIELDS) * sizeof(double));
+    for (int64_t k = 0; k < num_around; k++) {
+        const double *t = s->transform + w->around[k] * s->width * s->width, *right = w->right + k * s->width * FIELDS;
+        for (int64_t d = 0; d < s->width; d++) {
+            int64_t to = w->position[k * s->width + d];
+            for (int64_t c = 0; c < s->width && to >= 0; c++) {
+                if (t[c * s->width + d] != 0.0) add_row(w->ordered + FIELDS * to, t[c * s->width + d], right + FIELDS * c);
+            }
+        }
+    }
+}
+
+/* moved (rows, FIELDS): T times the solution of each image around. */
+INLINE void spread_columns(const base_inverse *s, const workspace *w, int64_t num_around) {
+    memset(w->moved, 0, (size_t)(num_around * s->width * FIELDS) * sizeof(double));
+    for (int64_t k = 0; k < num_around; k++) {
+        const double *t = s->transform + w->around[k] * s->width * s->width;
+        double *moved = w->moved + k * s->width * FIELDS;
+        for (int64_t c = 0; c < s->width; c++) {
+            for (int64_t d = 0; d < s->width; d++) {
+                int64_t from = w->position[k * s->width + d];
+                if (from >= 0 && t[c * s->width + d] != 0.0) add_row(moved + FIELDS * c, t[c * s->width + d], w->solution + FIELDS * from);
+            }
+        }
+    }
+}
+
+/* The rows of an image's points: xyz (n, 3), predicted (n, 2). */
+static void look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted) {
+    for (int64_t i = 0; i < n; i++) {
+        int64_t source = p->source[first + i];
+        const double *from = p->xyz + 3 * p->points[m->point_idx[first + i]], *xy = p->observed + 2 * p->observation_row[source];
+        for (int axis = 0; axis < 3; axis++) xyz[3 * i + axis] = from[axis];
+        for (int axis = 0; axis < 2; axis++) predicted[2 * i + axis] = xy[axis] - p->residuals[axis * p->num_residuals + source];
+    }
+}
+
+/* What the tests of some images need of their 44 candidate functions; no image around has included fields.
+ *
+ * images (num); facts (num, 27), is_fisheye, power (num): as joint_fields has them.    most_rows, most_views: of these images.
+ * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12, 12): w E^T E; score (44); right,
+ * solution (width, 44): R and B at its own columns, zero where it has none. */
+WIDE KERNEL int64_t joint_scores(
+    const joint_model *m, const base_inverse *s, const seen_points *p, int64_t num, const int64_t *images, const double *facts,
+    const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t *status, int64_t *num_tracks,
+    double *gram, double *meat, double *plain, double *dense_plain, double *score, double *right, double *solution) {
+    int64_t most_around = most_views < m->num_images ? most_views : m->num_images, width = m->width;
+    workspace w;
+    w.most_rows = most_rows, w.most_views = most_views, w.most_columns = most_around * width;
+    if (!has_room(&w, m->num_images, width)) {
+        leave(&w);
+        return NO_MEMORY;
+    }
+    memset(right, 0, (size_t)(num * width * FIELDS) * sizeof *right);
+    memset(solution, 0, (size_t)(num * width * FIELDS) * sizeof *solution);
+    for (int64_t k = 0; k < num; k++) {
+        int64_t image = images[k], first = m->offsets[image], n = m->offsets[image + 1] - first, found[2];
+        double *g = gram + k * FIELDS * FIELDS, *v = meat + k * FIELDS * FIELDS;
+        look_up(m, p, first, n, w.xyz, w.predicted);
+        status[k] = joint_fields(m, image, facts + 27 * k, w.xyz, w.predicted, is_fisheye[k], power[k], w.scalar, w.dense);
+        if (status[k] != DONE) continue;
+        num_tracks[k] = number_tracks(m, first, n, w.track);
+        status[k] = joint_first(
+            m, w.place, image, w.scalar, w.dense, w.track, num_tracks[k], w.most_columns, w.view, w.own, w.around, w.start, found,
+            w.absorbing, w.right, g, plain + k * SCALAR * SCALAR, dense_plain + k * DENSE * DENSE, score + k * FIELDS,
+            w.track_score, w.scores, most_views * width);
+        if (status[k] != DONE) continue;
+        int64_t count = order_columns(s, &w, found[0]);
+        collect_columns(s, &w, found[0], count);
+        if (!times_inverse(s, w.keys, w.column, count, w.ordered, w.scaled, w.solution)) {
+            status[k] = NEEDS_NUMPY;
+            continue;
+        }
+        spread_columns(s, &w, found[0]);
+        joint_second(m, found[0], w.own, w.around, w.start, w.track, w.scores, w.moved, w.track_score);
+        add_products(count, w.ordered, w.solution, -1.0, g);
+        for (int64_t a = 0; a < FIELDS; a++) {
+            for (int64_t b = 0; b < a; b++) g[FIELDS * a + b] = g[FIELDS * b + a] = 0.5 * (g[FIELDS * a + b] + g[FIELDS * b + a]);
+        }
+        memset(v, 0, FIELDS * FIELDS * sizeof *v);
+        add_products(num_tracks[k], w.track_score, w.track_score, 1.0, v);
+        for (int64_t j = 0; j < found[0]; j++) {
+            for (int64_t c = 0; w.around[j] == image && c < width; c++) {
+                int64_t from = w.position[j * width + c], at = (k * width + c) * FIELDS;
+                if (from < 0) continue;
+                memcpy(right + at, w.ordered + FIELDS * from, FIELDS * sizeof *right);
+                memcpy(solution + at, w.solution + FIELDS * from, FIELDS * sizeof *solution);
+            }
+        }
+    }
+    leave(&w);
+    return DONE;
+}
