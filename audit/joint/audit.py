@@ -112,8 +112,8 @@ def _of_block(
     steps = tuple(settled.get(step.camera_idx, step) for step in steps)
     gains = [Gains(math.nan, math.nan, math.nan)] * len(block.core)
     covariances = [np.zeros((0, 0))] * len(block.core)
-    for image, covariance in covariance_of.items():
-        gains[image], covariances[image] = image_gains(system, image), covariance
+    for (image, covariance), own in zip(covariance_of.items(), image_gains(system, core), strict=True):
+        gains[image], covariances[image] = own, covariance
     counts = np.diff(system.observations.offsets)
     beside = ImpliedBeside(system, steps)
     misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)

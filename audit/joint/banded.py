@@ -177,6 +177,24 @@ class BandedInverse:
         out -= null @ (pull.T @ scaled) + pull @ (null.T @ scaled)
         return np.asarray(scale * out)
 
+    def blocks(self, columns: IntArray) -> FloatArray:
+        """(B, k, k) entries of S^+ at columns (B, k)."""
+        place, width = self.factor.band.place[columns], self.factor.band.width
+        lower = np.minimum(place[:, :, None], place[:, None, :])
+        higher = np.maximum(place[:, :, None], place[:, None, :])
+        starts, sizes = _places_in_flat(self.near)
+        number = lower // width
+        far = (higher - number * width >= sizes[number]).any(axis=(1, 2))
+        at = starts[number] + (lower - number * width) * sizes[number] + higher - number * width
+        out = self.flat.take(np.where(far[:, None, None], 0, at))
+        outer = self.factor.null[place] @ self.pull[place].swapaxes(1, 2)
+        out -= outer + outer.swapaxes(1, 2)
+        scale = self.inverse_scale[columns]
+        out *= scale[:, None, :] * scale[:, :, None]
+        for k in np.flatnonzero(far).tolist():
+            out[k] = self.block(columns[k])
+        return np.asarray(out)
+
     def arrays(self) -> BandArrays:
         """As compiled sums take it."""
         band, starts = self.factor.band, _places_in_flat(self.near)

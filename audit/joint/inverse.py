@@ -51,6 +51,10 @@ class SymmetricInverse(Protocol):
         """(k, k) entries of S^+ at some columns."""
         ...
 
+    def blocks(self, columns: IntArray) -> FloatArray:
+        """(B, k, k) entries of S^+ at columns (B, k)."""
+        ...
+
     def arrays(self) -> FloatArray | BandArrays:
         """As compiled sums take it."""
         ...
@@ -77,6 +81,10 @@ class DenseInverse:
     def within(self, columns: IntArray, right: FloatArray) -> FloatArray:
         """The entries of S^+ at some columns @ right: (k, c) of (k, c)."""
         return np.asarray(self.block(columns) @ right)
+
+    def blocks(self, columns: IntArray) -> FloatArray:
+        """(B, k, k) entries of S^+ at columns (B, k)."""
+        return self.array[columns[:, :, None], columns[:, None, :]]
 
     def arrays(self) -> FloatArray:
         """S^+ (D, D) in C order, as compiled sums take it; symmetric."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,8 +12,9 @@ import numpy as np
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.table.thresholds import MIN_OWN_STEP_SDS
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
+_KEPT_EIGENVALUE: Final = 1e-12
 _CURVED: Final = 0.01  # relative step of a focal length from which on its second order matters
 
 
@@ -99,10 +100,25 @@ def own_parameters(
     missing = [camera for camera in cameras if camera not in covariances]
     found = system.covariances([layout.own_of_camera(camera) for camera in missing])
     covariances.update(zip(missing, found, strict=True))
-    return tuple(_camera_step(system, camera, covariances[camera]) for camera in cameras)
+    gains = _gains_of_cameras(system, cameras)
+    return tuple(_camera_step(system, camera, covariances[camera], gains[camera]) for camera in cameras)
 
 
-def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -> CameraStep:
+def _gains_of_cameras(system: JointSystem, cameras: Sequence[int]) -> dict[int, tuple[float, float]]:
+    """What either step of each camera's own parameters gains, in units of the noise squared."""
+    own = {camera: system.observations.layout.own_of_camera(camera) for camera in cameras}
+    out: dict[int, tuple[float, float]] = {}
+    for num in {columns.size for columns in own.values()}:
+        alike = [camera for camera in cameras if own[camera].size == num]
+        columns = np.stack([own[camera] for camera in alike]).astype(np.int64)
+        gains = (walds(system, columns, step[columns]).tolist() for step in (system.base.step, system.plain_step))
+        out.update(zip(alike, zip(*gains, strict=True), strict=True))
+    return out
+
+
+def _camera_step(
+    system: JointSystem, camera_idx: int, covariance: FloatArray, gains: tuple[float, float]
+) -> CameraStep:
     observations, layout = system.observations, system.observations.layout
     camera = system.model.camera(camera_idx)
     columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
@@ -113,7 +129,7 @@ def _camera_step(system: JointSystem, camera_idx: int, covariance: FloatArray) -
     sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     focals = [params.index(i) for i in camera.model.focal_idxs]
     sd_focal_rel = _sd_focal_rel(covariance[np.ix_(focals, focals)], camera.params[list(camera.model.focal_idxs)])
-    px = [sigma_px * math.sqrt(wald(system, columns, value) / n) if n else math.nan for value in (step, plain)]
+    px = [sigma_px * math.sqrt(gain / n) if n else math.nan for gain in gains]
     return CameraStep(
         camera_idx,
         images,
@@ -188,22 +204,26 @@ def _implied_focal(stored: float, step: float, relief: float) -> float:
     return stored * scale * scale / (scale - relief)
 
 
-def wald(system: JointSystem, columns: IntArray, step: FloatArray) -> float:
-    """Return step^T [(S^+)_bb]^-1 step at some columns b; unidentified directions gain nothing."""
-    block = system.base.inverse.main.block(columns)
-    diagonal = block.diagonal()
-    used = (diagonal > 0) & ~system.base.inverse.unidentified[columns]
-    if not used.any():
-        return 0.0
-    scale = np.sqrt(diagonal[used])
-    values, vectors = np.linalg.eigh(block[np.ix_(used, used)] / scale / scale[:, None])
-    kept = values > 1e-12
-    along = vectors[:, kept].T @ (step[used] / scale)
-    return float((along**2 / values[kept]).sum())
+def walds(system: JointSystem, columns: IntArray, steps: FloatArray) -> FloatArray:
+    """Return step^T [(S^+)_bb]^-1 step (B,) at columns b (B, k); unidentified directions gain nothing."""
+    return _walds(system.base.inverse.main.blocks(columns), ~system.base.inverse.unidentified[columns], steps)
 
 
-def image_gains(system: JointSystem, image_idx: int) -> Gains:
-    """Return what freeing an image's pose alone, its camera's own parameters alone, or both would gain.
+def _walds(blocks: FloatArray, identified: BoolArray, steps: FloatArray) -> FloatArray:
+    """The same of blocks (B, k, k) of S^+ and who is identified (B, k)."""
+    diagonal = np.einsum("bii->bi", blocks)
+    used = (diagonal > 0) & identified
+    scale = np.sqrt(np.where(used, diagonal, 1.0))
+    unit = np.where(used[:, :, None] & used[:, None, :], blocks / scale[:, None, :] / scale[:, :, None], 0.0)
+    np.einsum("bii->bi", unit)[~used] = 1.0  # a parameter by itself, which does not move
+    values, vectors = np.linalg.eigh(unit)
+    along = (vectors.swapaxes(1, 2) @ np.where(used, steps / scale, 0.0)[:, :, None])[:, :, 0]
+    kept = values > _KEPT_EIGENVALUE
+    return np.asarray((np.where(kept, along, 0.0) ** 2 / np.where(kept, values, 1.0)).sum(axis=1))
+
+
+def image_gains(system: JointSystem, image_idxs: Sequence[int]) -> list[Gains]:
+    """Return what freeing each image's pose alone, its camera's own parameters alone, or both would gain.
 
     Notes
     -----
@@ -212,12 +232,18 @@ def image_gains(system: JointSystem, image_idx: int) -> Gains:
     everything alone, and next to nothing beside a pose that makes up for it.
     """
     layout = system.observations.layout
-    if not layout.takes_part(image_idx):
-        return Gains(math.nan, math.nan, math.nan)
-    columns = layout.columns[image_idx]
-    columns = columns[columns < layout.num_columns]
-    step = system.base.step[columns]
-    both = wald(system, columns, step)
-    beside_camera = wald(system, columns[:NUM_POSE], step[:NUM_POSE])
-    beside_pose = wald(system, columns[NUM_POSE:], step[NUM_POSE:])
-    return Gains(pose=both - beside_pose, camera=both - beside_camera, both=both)
+    out = [Gains(math.nan, math.nan, math.nan)] * len(image_idxs)
+    columns = layout.columns[list(image_idxs)]
+    num_real = (columns < layout.num_columns).sum(axis=1)
+    for num in np.unique(num_real[num_real > 0]).tolist():
+        places = np.flatnonzero(num_real == num)
+        own = columns[places, :num]  # padding comes last
+        blocks, identified = system.base.inverse.main.blocks(own), ~system.base.inverse.unidentified[own]
+        steps = system.base.step[own]
+        both, beside_camera, beside_pose = (
+            _walds(blocks[:, part, part], identified[:, part], steps[:, part]).tolist()
+            for part in (slice(None), slice(NUM_POSE), slice(NUM_POSE, None))
+        )
+        for k, place in enumerate(places.tolist()):
+            out[place] = Gains(pose=both[k] - beside_pose[k], camera=both[k] - beside_camera[k], both=both[k])
+    return out

@@ -53,7 +53,7 @@ def assert_same(found, expected, order=None):
     for new_idx, old_idx in enumerate(order):
         assert misfit.included[new_idx] == old_misfit.included[old_idx]
         assert misfit.cause[new_idx] is old_misfit.cause[old_idx]
-        gains, old_gains = image_gains(system, new_idx), image_gains(old_system, old_idx)
+        (gains,), (old_gains,) = image_gains(system, [new_idx]), image_gains(old_system, [old_idx])
         assert_allclose(dataclasses.astuple(gains), dataclasses.astuple(old_gains), rtol=1e-4, atol=1e-4)
         for group in GROUPS:
             new, old = misfit.tests[new_idx][group], old_misfit.tests[old_idx][group]

@@ -15,6 +15,7 @@ from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
+from sfm_audit.audit.joint.own import walds
 
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
 
@@ -132,3 +133,31 @@ def test_blocks_of_columns_that_lie_apart_have_the_same_covariance(street):
     apart = np.concatenate([street.observations.layout.columns[3], street.observations.layout.columns[50]])
     (both,), (first,) = street.covariances([apart]), street.covariances([apart[:8]])
     assert_allclose(both[:8, :8], first, rtol=1e-6)
+
+
+def test_blocks_of_many_images_are_those_of_one(street, dense):
+    columns = street.observations.layout.columns[:, :8]
+    far = np.concatenate([columns[:1, :4], columns[-1:, :4]], axis=1)
+    asked = np.concatenate([columns, far])
+    for main in (street.base.inverse.main, dense.main):
+        for found, each in zip(main.blocks(asked), asked, strict=True):
+            expected = main.block(each)
+            unit = np.sqrt(expected.diagonal())
+            assert_allclose(found / unit / unit[:, None], expected / unit / unit[:, None], atol=1e-12)
+
+
+def test_what_a_step_gains_is_its_wald_statistic(street):
+    rng, columns = np.random.default_rng(0), street.observations.layout.columns[[3, 8, 20]]
+    steps = rng.normal(size=columns.shape) * np.sqrt(np.abs(street.base.inverse.main.blocks(columns)[:, 0, :1]))
+    blocks = street.base.inverse.main.blocks(columns)
+    expected = [step @ np.linalg.solve(block, step) for block, step in zip(blocks, steps, strict=True)]
+    assert_allclose(walds(street, columns, steps), expected, rtol=1e-6)
+    lost = street.base.inverse.unidentified.copy()
+    lost[columns[1, 2:5]] = True
+    less = dataclasses.replace(
+        street, base=dataclasses.replace(street.base, inverse=dataclasses.replace(street.base.inverse, unidentified=lost))
+    )
+    left = np.delete(np.arange(8), [2, 3, 4])
+    own = steps[1, left] @ np.linalg.solve(blocks[1][np.ix_(left, left)], steps[1, left])
+    assert_allclose(walds(less, columns, steps), [expected[0], own, expected[2]], rtol=1e-6)
+    assert walds(street, columns[:0], steps[:0]).shape == (0,)

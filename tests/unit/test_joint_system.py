@@ -364,9 +364,9 @@ def test_a_moved_pose_is_the_pose_s_gain_and_a_wrong_focal_length_the_camera_s()
     turn = Rotation.from_rotvec([3e-3, -2e-3, 4e-3])
     quat[3] = (turn * Rotation.from_quat(quat[3], scalar_first=True)).as_quat(scalar_first=True)
     shift[3] = turn.apply(shift[3])
-    gains = image_gains(system_of(with_poses(model, quat, shift)), 3)
+    (gains,) = image_gains(system_of(with_poses(model, quat, shift)), [3])
     assert gains.pose >= 0.9 * gains.both
     assert gains.camera < 0.5 * gains.both
     focal = model.cameras.params[model.cameras.param_offsets[3]]
-    gains = image_gains(system_of(with_param(model, 3, 0, 1.02 * focal)), 3)
+    (gains,) = image_gains(system_of(with_param(model, 3, 0, 1.02 * focal)), [3])
     assert gains.camera >= 0.9 * gains.both
