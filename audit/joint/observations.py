@@ -111,8 +111,8 @@ class JointObservations:
 
     @property
     def plain_weight(self) -> FloatArray:
-        """(n,) 1 / s^2, 1 / px^2."""
-        return np.repeat(self.sigma_px, np.diff(self.offsets)) ** -2.0
+        """(n,) 1 / s^2, 1 / px^2; where nothing loses weight to the last bit the same as ``weight``."""
+        return np.asarray(1.0 / np.repeat(self.sigma_px, np.diff(self.offsets)) ** 2)
 
     def inliers(self, image_idx: int, chosen: slice | IntArray = EVERY) -> ImageInliers:
         """The observations of an image that are in the system, or some of them."""

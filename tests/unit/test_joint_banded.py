@@ -155,7 +155,8 @@ def test_what_a_step_gains_is_its_wald_statistic(street):
     lost = street.base.inverse.unidentified.copy()
     lost[columns[1, 2:5]] = True
     less = dataclasses.replace(
-        street, base=dataclasses.replace(street.base, inverse=dataclasses.replace(street.base.inverse, unidentified=lost))
+        street,
+        base=dataclasses.replace(street.base, inverse=dataclasses.replace(street.base.inverse, unidentified=lost)),
     )
     left = np.delete(np.arange(8), [2, 3, 4])
     own = steps[1, left] @ np.linalg.solve(blocks[1][np.ix_(left, left)], steps[1, left])

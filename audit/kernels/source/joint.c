@@ -371,19 +371,19 @@ WIDE KERNEL int64_t joint_second(
 
 /* One pair of systems: the robust weights and those of the second system. `padded` is the width, rounded up to LANES.
  *
- * slab, other_slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the
- * design without T). */
+ * slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the design
+ * without T).    more_slab: what the second system has more: of points whose weights differ, all others say the same twice. */
 static inline __attribute__((always_inline)) void add_slab(
     const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
-    const double *other_absorbed, double *slab, double *other_slab) {
+    const double *other_absorbed, const unsigned char *differs, double *slab, double *more_slab) {
     int64_t width = m->width;
     pair_of_rows pair = {{0.0}, {0.0}};
     double along[3][MOST_COLUMNS];
     for (int64_t j = near->start[k]; j < near->start[k + 1]; j++) {
         soon(m, near->view, j, near->start[k + 1]);
         const double *dx = m->design + near->view[j] * 2 * width, *dy = dx + width;
-        const double *own = absorbed + 3 * padded * near->own[j], *other = other_absorbed + 3 * padded * near->own[j];
-        double w = m->weight[near->view[j]], plain = m->other_weight[near->view[j]];
+        const double *own = absorbed + 3 * padded * near->own[j];
+        double w = m->weight[near->view[j]];
         take_rows(dx, dy, width, &pair);
         for (int i = 0; i < 3; i++) {
             double x = dx[3 + i], y = dy[3 + i];
@@ -391,13 +391,23 @@ static inline __attribute__((always_inline)) void add_slab(
         }
         for (int64_t c = 0; c < padded; c++) {
             double a0 = w * along[0][c], a1 = w * along[1][c], a2 = w * along[2][c];
-            double b0 = plain * along[0][c], b1 = plain * along[1][c], b2 = plain * along[2][c];
             wide p0 = {a0, a0, a0, a0}, p1 = {a1, a1, a1, a1}, p2 = {a2, a2, a2, a2};
-            wide q0 = {b0, b0, b0, b0}, q1 = {b1, b1, b1, b1}, q2 = {b2, b2, b2, b2};
-            double *to = slab + c * padded, *other_to = other_slab + c * padded;
+            double *to = slab + c * padded;
             for (int64_t d = 0; d < padded; d += LANES) {
                 STORE(to + d) -= p0 * LOAD(own + d) + p1 * LOAD(own + padded + d) + p2 * LOAD(own + 2 * padded + d);
-                STORE(other_to + d) -= q0 * LOAD(other + d) + q1 * LOAD(other + padded + d) + q2 * LOAD(other + 2 * padded + d);
+            }
+        }
+        if (!differs[near->own[j]]) continue;
+        const double *other = other_absorbed + 3 * padded * near->own[j];
+        double plain = m->other_weight[near->view[j]];
+        for (int64_t c = 0; c < padded; c++) {
+            double *to = more_slab + c * padded;
+            for (int i = 0; i < 3; i++) {
+                double a = w * along[i][c], b = plain * along[i][c];
+                wide p = {a, a, a, a}, q = {b, b, b, b};
+                for (int64_t d = 0; d < padded; d += LANES) {
+                    STORE(to + d) += p * LOAD(own + i * padded + d) - q * LOAD(other + i * padded + d);
+                }
             }
         }
     }
@@ -406,13 +416,20 @@ static inline __attribute__((always_inline)) void add_slab(
 /* N (n, 2, width) = design T of an image's rows. T comes first: products of columns that all but cancel in it (the depth of what a
  * long lens sees) would lose twice the digits. */
 static void take_nuisance(const joint_model *m, int64_t first, int64_t n, const double *transform, double *out) {
-    int64_t width = m->width;
+    int64_t width = m->width, from[MOST_COLUMNS], until[MOST_COLUMNS]; /* T is the identity but for a few small blocks */
+    for (int64_t d = 0; d < width; d++) {
+        from[d] = width, until[d] = 0;
+        for (int64_t c = width - 1; c >= 0; c--) {
+            if (transform[c * width + d] != 0.0) from[d] = c, until[d] = until[d] ? until[d] : c + 1;
+        }
+    }
     for (int64_t row = 0; row < 2 * n; row++) {
-        const double *from = m->design + (2 * first + row) * width;
+        const double *given = m->design + (2 * first + row) * width;
         double *to = out + row * width;
-        memset(to, 0, (size_t)width * sizeof *to);
-        for (int64_t c = 0; c < width; c++) {
-            for (int64_t d = 0; d < width; d++) to[d] += from[c] * transform[c * width + d];
+        for (int64_t d = 0; d < width; d++) {
+            double sum = 0.0;
+            for (int64_t c = from[d]; c < until[d]; c++) sum += given[c] * transform[c * width + d];
+            to[d] = sum;
         }
     }
 }
@@ -469,7 +486,8 @@ WIDE KERNEL int64_t joint_normal(
     int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
     double *absorbed = malloc((size_t)(6 * padded * n + 1) * sizeof *absorbed), *other = absorbed + 3 * padded * n;
     double *nuisance = malloc((size_t)(2 * width * n + 1) * sizeof *nuisance);
-    int64_t status = view && start && own && absorbed && nuisance ? DONE : NO_MEMORY;
+    unsigned char *differs = malloc((size_t)n + 1);
+    int64_t status = view && start && own && absorbed && nuisance && differs ? DONE : NO_MEMORY;
     if (status == DONE) {
         surroundings near = {view, own, around, start, 0, 0};
         collect(m, first, first + n, image, place, &near);
@@ -481,15 +499,19 @@ WIDE KERNEL int64_t joint_normal(
                 SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
             }
             const double *mine = nuisance + 2 * width * i;
+            int64_t point = m->point_idx[first + i];
+            /* of a point whose weights are the same, the inverses are, to the last bit */
+            differs[i] = memcmp(m->point_inverse + 9 * point, m->other_inverse + 9 * point, 9 * sizeof(double)) != 0;
             absorb_row(m, first + i, mine, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
-            absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
+            if (differs[i]) absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
         }
         for (int64_t k = 0; k < near.num_images; k++) {
             double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
             memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
-            if (padded == 8) add_slab(m, 8, &near, k, absorbed, other, here[0], here[1]);
-            else if (padded == 12) add_slab(m, 12, &near, k, absorbed, other, here[0], here[1]);
-            else add_slab(m, padded, &near, k, absorbed, other, here[0], here[1]);
+            if (padded == 8) add_slab(m, 8, &near, k, absorbed, other, differs, here[0], here[1]);
+            else if (padded == 12) add_slab(m, 12, &near, k, absorbed, other, differs, here[0], here[1]);
+            else add_slab(m, padded, &near, k, absorbed, other, differs, here[0], here[1]);
+            for (int64_t c = 0; c < size; c++) here[1][c] += here[0][c];
             trim(here[0], padded, width, scale, slab + k * width * width);
             trim(here[1], padded, width, scale, other_slab + k * width * width);
         }
@@ -501,7 +523,7 @@ WIDE KERNEL int64_t joint_normal(
             else add_own(width, first, n, nuisance, weight, values, gram, right);
         }
     }
-    free(view), free(start), free(own), free(absorbed), free(nuisance);
+    free(view), free(start), free(own), free(absorbed), free(nuisance), free(differs);
     return status;
 }
 
