@@ -132,10 +132,11 @@ def _statistics(
         point_jacobian = np.where(differentiable, point_jacobian, 0.0)
     length = np.bincount(point_idx, minlength=num_points).astype(np.int32)
     inverse, rank = inverse_information(point_jacobian, point_idx, num_points)
-    track_length = length.take(point_idx)
     verified = differentiable
-    verified &= track_length >= min_track_length
+    for part in _chunks(verified.size):
+        verified[part] &= length.take(point_idx[part]) >= min_track_length
     whitened, square, removable = _whiten(residuals_px, point_jacobian, point_idx, inverse, (verified, min_eigenvalue))
+    del inverse  # the largest array that is not kept
     track_sq = sum_by_point(square, point_idx, num_points)
     other_sq = square
     for part in _chunks(len(square)):
@@ -145,7 +146,7 @@ def _statistics(
     return TrackStatistics(
         whitened,
         verified,
-        track_length,
+        length.take(point_idx),
         other_sq,
         (2 * length - 2 - rank).take(point_idx),
         removable,
@@ -189,7 +190,9 @@ def _whiten(
     for axis in range(3):
         _sum_of_two_products(point_jacobian[:, axis], residuals_px, square)
         gradient[axis] = sum_by_point(square, point_idx, inverse.shape[1])
-    step = symmetric_times(inverse, gradient)  # A^+ J^T eps: where the points would move
+    step = gradient  # A^+ J^T eps: where the points would move
+    for part in _chunks(inverse.shape[1]):
+        step[:, part] = symmetric_times(inverse[:, part], gradient[:, part])
     whitened = np.empty_like(residuals_px)
     removable = 0.0
     for part in _chunks(point_idx.size):

@@ -20,6 +20,7 @@ from scipy.linalg import eigh
 
 from sfm_audit.audit.kernels import witnesses as kernels
 from sfm_audit.audit.witnesses.evidence import ColumnValues, Evidence, WitnessReport
+from sfm_audit.audit.witnesses.looks_together import sums_of_pairs
 from sfm_audit.audit.witnesses.should_see import MAX_ANGLE_DEG, MAX_DISTANCE_RATIO, ShouldSee, should_see
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import Finding, FindingCode
@@ -37,7 +38,7 @@ _MIN_EITHER: Final = 8  # points that either of two images sees and both should
 _NUM_SPLITS: Final = 3
 _KNOWN: Final = 1e-6
 """Smaller parts of an eigenvector, and smaller distances between eigenvalues, of the largest are taken for rounding."""
-_FULL_BELOW: Final = 20.0  # entries of a full matrix per product of a sparse one
+_FULL_BELOW: Final = 20.0  # entries of full matrices per pair of looks at a point
 _FULL_AT_ONCE: Final = 1 << 21  # numbers: 16 MB
 _STEP_DEG: Final = 1.0  # pairs are compared with pairs of the same angle
 _MIN_PAIRS: Final = 4  # in such a step, in either group, and half as many across
@@ -142,6 +143,14 @@ def pair_sums(seen: ShouldSee) -> PairSums:
     if found is not None:
         return PairSums(*found)
     num = np.bincount(seen.point, minlength=seen.num_points)
+    num_products = float(num.astype(np.float64) @ num)
+    if seen.num_points * float(seen.num_images) ** 2 > _FULL_BELOW * num_products:
+        return PairSums(*sums_of_pairs(seen, log_distance, num))
+    return _sums_in_full(seen, log_distance, num)
+
+
+def _sums_in_full(seen: ShouldSee, log_distance: FloatArray, num: IntArray) -> PairSums:
+    """`pair_sums` by products of full matrices, which are faster where most images look at the same place."""
     rate = np.bincount(seen.point, seen.sees, minlength=seen.num_points) / np.maximum(num, 1)
     should, sees = seen.matrix(np.ones(len(seen.point))), seen.matrix(seen.sees)
     together = crossed(should, should)
@@ -194,15 +203,8 @@ def sides(values: FloatArray, vectors: FloatArray) -> Iterator[IntArray]:
 
 
 def crossed(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
-    """Return left^T right (I, I) of two (P, I).
-
-    As full matrices, some points at a time, where images that all look at the same place fill them: a sparse product
-    costs as much as a hundred products of a full one.
-    """
+    """Return left^T right (I, I) of two (P, I), as full matrices, some points at a time."""
     num_points, num_images = left.shape
-    num_products = float(np.diff(left.indptr).astype(np.float64) @ np.diff(right.indptr))
-    if num_points * float(num_images) ** 2 > _FULL_BELOW * num_products:
-        return np.asarray((left.T @ right).toarray())
     out = np.zeros((num_images, num_images))
     step = max(1, _FULL_AT_ONCE // max(num_images, 1))
     for start in range(0, num_points, step):
@@ -211,9 +213,14 @@ def crossed(left: sparse.csr_array, right: sparse.csr_array) -> FloatArray:
 
 
 def _leading(symmetric: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the largest eigenvalues (_NUM_SPLITS + 1,), largest first, and their vectors (n, _NUM_SPLITS + 1)."""
+    """Return the largest eigenvalues (_NUM_SPLITS + 1,), largest first, and their vectors (n, _NUM_SPLITS + 1).
+
+    The matrix is written over.
+    """
     n = len(symmetric)
-    values, vectors = eigh(symmetric, subset_by_index=(n - _NUM_SPLITS - 1, n - 1))
+    values, vectors = eigh(
+        symmetric.T, subset_by_index=(n - _NUM_SPLITS - 1, n - 1), overwrite_a=True
+    )  # LAPACK's order
     return values[::-1], vectors[:, ::-1]
 
 

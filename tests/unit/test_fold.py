@@ -1,17 +1,17 @@
 """Two groups of images at one place that see different points (method.md section 13)."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fold_samples import ring_model, sides
 from gate_samples import scene, write_run
-from scipy import sparse
 
 from sfm_audit.audit.cli.main import main
 from sfm_audit.audit.inliers.residuals import model_residuals
 from sfm_audit.audit.kernels import numpy_only
-from sfm_audit.audit.witnesses import fold
+from sfm_audit.audit.witnesses import fold, looks_together
 from sfm_audit.audit.witnesses import should_see as looking
 from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.audit.witnesses.fold import MIN_SCORE, ask_fold, find_fold
@@ -152,10 +152,18 @@ def test_filter_keeps_one_side(tmp_path, monkeypatch, capsys):
     assert "holds no fold_group" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("share", [0.02, 0.9])
-def test_full_and_sparse_products_are_the_same(share, monkeypatch):
+def test_pairs_one_by_one_and_products_of_full_matrices_are_the_same(monkeypatch):
     rng = np.random.default_rng(0)
-    left, right = (sparse.csr_array(rng.normal(size=(300, 40)) * (rng.random((300, 40)) < share)) for _ in range(2))
-    expected = (left.T @ right).toarray()
+    point, image = np.nonzero(rng.random((300, 40)) < rng.uniform(0.0, 0.5, 300)[:, None])
+    order = np.lexsort((point, image))
+    ray, distance = rng.normal(size=(3, len(point))), rng.uniform(1.0, 2.0, len(point))
+    seen = ShouldSee(300, 40, point[order], image[order], rng.random(len(point)) < 0.6, ray, distance)
+    num, log_distance = np.bincount(seen.point, minlength=300), np.log(distance)
     monkeypatch.setattr(fold, "_FULL_AT_ONCE", 4000)  # several parts
-    np.testing.assert_allclose(fold.crossed(left, right), expected, atol=1e-12)
+    expected = fold._sums_in_full(seen, log_distance, num)
+    for at_once in (1, 500, 1 << 20):
+        monkeypatch.setattr(looks_together, "_AT_ONCE", at_once)
+        found = fold.PairSums(*looks_together.sums_of_pairs(seen, log_distance, num))
+        for field in fields(expected):
+            here, there = getattr(found, field.name), getattr(expected, field.name)
+            np.testing.assert_allclose(here, there, rtol=1e-12, atol=1e-12, err_msg=field.name)
