@@ -5,6 +5,7 @@ import signal
 import stat
 import time
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -59,6 +60,12 @@ def run_out_of_memory(task: Task) -> Outcome:
 def recurse(task: Task) -> Outcome:
     """Call itself without end on models of the scene called broken."""
     return recurse(task) if task.ref.scene == "broken" else audit_one(task)
+
+
+def fail_in_three_ways(task: Task) -> Outcome:
+    """Raise another error nobody expects on models of the scenes broken, deadly and z."""
+    fails = {"broken": break_down, "deadly": run_out_of_memory, "z": recurse}.get(task.ref.scene)
+    return audit_one(task) if fails is None else fails(replace(task, ref=replace(task.ref, scene="broken")))
 
 
 def sleep(task: Task) -> Outcome:

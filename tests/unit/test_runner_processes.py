@@ -7,7 +7,6 @@ import signal
 import tempfile
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import audit_stubs
 import numpy as np
@@ -15,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import threadpoolctl
 from corpus import UNREADABLE, corpus_models
-from run_samples import make_ref, wait_for, write_models
+from run_samples import make_ref, wait_for
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import ModelAuditor, audit_model
@@ -23,7 +22,7 @@ from sfm_audit.audit.kernels.threads import threads
 from sfm_audit.audit.schedule.images import image_processes, read_shared, write_shared
 from sfm_audit.audit.schedule.lanes import Died, Lanes, RemoteTracebackError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
-from sfm_audit.audit.schedule.task import Audited, Failure, Task, audit_one
+from sfm_audit.audit.schedule.task import Audited, Task, audit_one
 from sfm_audit.audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
 from sfm_audit.loaders import discover, open_model
 
@@ -70,10 +69,15 @@ def audited(location, spread=None, **config):
     return audit_model(open_model(location), AuditConfig(**config), observations=True, **options).tables
 
 
-def check_spread_changes_nothing(location, num_processes, **config):
-    alone = audited(location, **config)
-    with image_processes(num_processes) as spread:
-        together = audited(location, spread, **config)
+@pytest.fixture(scope="module")
+def spread():
+    """Three processes for all models."""
+    with image_processes(3) as start:
+        yield start
+
+
+def check_spread_changes_nothing(location, spread, **config):
+    alone, together = audited(location, **config), audited(location, spread, **config)
     assert alone.keys() == together.keys()
     for name, table in alone.items():
         assert table.equals(together[name]), name
@@ -89,19 +93,17 @@ def test_threads_change_nothing(scene, number):
 
 
 @pytest.mark.parametrize("noise", ["track", "constant"])
-def test_images_spread_over_processes_give_the_same_bits(scene, noise):
-    check_spread_changes_nothing(scene, 3, noise=noise)
+def test_images_spread_over_processes_give_the_same_bits(scene, spread, noise):
+    check_spread_changes_nothing(scene, spread, noise=noise)
 
 
 @pytest.mark.corpus
-def test_models_of_the_corpus_spread_over_processes_give_the_same_bits(corpus):
+def test_models_of_the_corpus_spread_over_processes_give_the_same_bits(corpus, spread):
     """SFM_AUDIT_SPREAD=1: every model of the corpus, not one."""
     chosen = corpus_models() if "SFM_AUDIT_SPREAD" in os.environ else [corpus / "models/own_south_building_sub_radial"]
-    with image_processes(2) as spread:
-        for location in chosen:
-            if location.name not in UNREADABLE:
-                alone, together = audited(location), audited(location, spread)
-                assert all(table.equals(together[name]) for name, table in alone.items()), location
+    for location in chosen:
+        if location.name not in UNREADABLE:
+            check_spread_changes_nothing(location, spread)
 
 
 def test_a_large_model_is_spread_by_the_runner_and_gives_the_same_bits(scene):
@@ -142,13 +144,12 @@ def test_a_model_one_of_whose_image_processes_dies_is_audited_again_in_one(scene
     assert isinstance(outcome, Audited)
 
 
-def test_without_room_for_the_shared_file_the_images_are_audited_in_turn(scene, monkeypatch):
+def test_without_room_for_the_shared_file_the_images_are_audited_in_turn(scene, spread, monkeypatch):
     def full(*_: object):
         raise OSError(28, "No space left on device")
 
-    with image_processes(2) as spread:
-        monkeypatch.setattr("sfm_audit.audit.schedule.images.write_shared", full)
-        assert audited(scene, spread)["images"].equals(audited(scene)["images"])
+    monkeypatch.setattr("sfm_audit.audit.schedule.images.write_shared", full)
+    assert audited(scene, spread)["images"].equals(audited(scene)["images"])
 
 
 def test_an_auditor_travels_without_its_processes(scene):
@@ -206,13 +207,3 @@ def test_an_error_in_the_caller_ends_the_processes_at_once():
         (process,) = [lane.process for lane, _ in lanes._busy.values()]
         raise ZeroDivisionError
     assert not process.is_alive()
-
-
-def test_a_model_whose_process_dies_twice_says_how(tmp_path):
-    write_models(tmp_path / "data", ["deadly"])
-    (ref,) = discover([tmp_path / "data"]).refs
-    ((_, outcome),) = in_processes([Task(ref, CONFIG, None)], 2, audit_stubs.die)
-    assert isinstance(outcome, Failure)
-    assert "died twice" in outcome.message
-    assert "(exit code 9)" in outcome.message
-    assert Path(ref.location).exists()
