@@ -6,7 +6,7 @@ Of many images at once: groups are columns, in the order of GROUPS.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,13 +119,13 @@ def decide_misfits(measured: MeasuredMisfit, *, alpha: float, tau_px: FloatArray
     return MisfitDecisions(measured, cause, px, q, tau_px, material & named[:, None], worth)
 
 
-def decide_misfit(groups: Mapping[MisfitGroup, GroupDiagnostics], *, alpha: float, tau_px: float) -> MisfitDecision:
-    """Return the same of one image or camera."""
-    measured = MeasuredMisfit.of([MisfitDiagnostics(groups, 0, math.nan)])
-    record = decide_misfits(measured, alpha=alpha, tau_px=np.array([tau_px])).record(0)
-    if record is None:
-        raise ValueError("tests of all groups are needed")
-    return record
+def decide_each(
+    tested: Sequence[Mapping[MisfitGroup, GroupDiagnostics]], *, alpha: float, tau_px: FloatArray
+) -> list[MisfitDecision]:
+    """Return the same of n images or cameras, one record each; tau_px (n,)."""
+    measured = MeasuredMisfit.of([MisfitDiagnostics(groups, 0, math.nan) for groups in tested])
+    decided = decide_misfits(measured, alpha=alpha, tau_px=tau_px)
+    return [record for i in range(len(tested)) if (record := decided.record(i)) is not None]
 
 
 def named_causes(measured: MeasuredMisfit, candidates: BoolArray) -> IntArray:

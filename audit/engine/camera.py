@@ -13,7 +13,7 @@ import numpy as np
 from sfm_audit.audit.camera_quality.measure import CameraQuality
 from sfm_audit.audit.decision.decisions import Decisions
 from sfm_audit.audit.decision.diagnostics import misfit_groups
-from sfm_audit.audit.decision.misfit import MisfitDecision, decide_misfit
+from sfm_audit.audit.decision.misfit import MisfitDecision, decide_each
 from sfm_audit.audit.inliers.joined import MAX_JOINED, joined_inliers
 from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
@@ -152,12 +152,14 @@ def audit_cameras(
     source = ModelSums(model, residuals)
     tests = [_pooled(source, group.only(holds), quality) for group in groups]
     significance = Significance.of(tests)
+    of_cameras = [
+        misfit_groups(test, q, num_observations=group.num_observations, sigma_px=_median(sigma_px[group.image_idxs]))
+        for group, test, q in zip(groups, tests, significance.q, strict=True)
+    ]
+    taus: FloatArray = np.array([_median(tau_px[group.image_idxs]) for group in groups], dtype=np.float64)
+    found = decide_each(of_cameras, alpha=alpha, tau_px=taus)
     out = []
-    for k, group in enumerate(groups):
-        num_observations = group.num_observations
-        sigma, tau = float(np.median(sigma_px[group.image_idxs])), float(np.median(tau_px[group.image_idxs]))
-        groups_of = misfit_groups(tests[k], significance.q[k], num_observations=num_observations, sigma_px=sigma)
-        misfit = decide_misfit(groups_of, alpha=alpha, tau_px=tau)
+    for group, test, misfit, tau in zip(groups, tests, found, taus.tolist(), strict=True):
         advice = advised_camera_model(
             group.camera,
             misfit.group if misfit.material else None,
@@ -167,9 +169,14 @@ def audit_cameras(
             alpha=alpha,
             tau_px=tau,
         )
-        counts = len(source.points_of(group.image_idxs.tolist())), num_observations
-        out.append(CameraAudit(group.camera, group.image_idxs, *counts, tests[k], misfit, advice))
+        counts = source.num_points_of(group.image_idxs.tolist()), group.num_observations
+        out.append(CameraAudit(group.camera, group.image_idxs, *counts, test, misfit, advice))
     return out
+
+
+def _median(values: FloatArray) -> float:
+    """Most cameras of a photo collection have one image."""
+    return float(values[0]) if len(values) == 1 else float(np.median(values))
 
 
 def _groups_of(model: SparseModel, residuals: ModelResiduals, image_idxs: IntArray) -> list[_CameraImages]:

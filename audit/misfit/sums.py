@@ -40,7 +40,7 @@ from sfm_audit.audit.misfit.nuisance import fitted_param_idxs
 from sfm_audit.audit.misfit.pooled import add_rows
 from sfm_audit.audit.misfit.score import Clusters
 from sfm_audit.audit.table.words import MisfitGroup
-from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray, distinct
 from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord, SparseModel, rotation_from_quat
 
@@ -107,6 +107,19 @@ class ModelSums:
         for points in seen_by:
             seen[points] = True
         return np.flatnonzero(seen).astype(np.int64)
+
+    def num_points_of(self, images: Sequence[int]) -> int:
+        """Return how many points these images see; nothing is sorted where it is one image."""
+        if len(images) != 1:
+            return len(self.points_of(images))
+        points = self.points(images[0])
+        place = np.arange(len(points), dtype=np.int32)
+        self._last_place[points] = place
+        return int(np.count_nonzero(self._last_place[points] == place))  # of a point seen twice one place is left
+
+    @cached_property
+    def _last_place(self) -> Int32Array:
+        return np.empty(len(self.model.points), dtype=np.int32)  # read where it was just written
 
     def tracks(self, images: Sequence[int]) -> tuple[IntArray, int]:
         """Return the number of each point (P,) among those that these images see, -1 for others; how many they are.

@@ -246,7 +246,7 @@ NAMED: Final = (
     Named(
         "tau of a camera is the largest of its images",
         "audit/engine/camera.py",
-        "float(np.median(tau_px[group.image_idxs]))",
+        "_median(tau_px[group.image_idxs])",
         "float(np.max(tau_px[group.image_idxs]))",
         NUMBERS,
     ),
