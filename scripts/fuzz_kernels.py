@@ -69,7 +69,17 @@ def call_near_entries(rng: np.random.Generator) -> None:
         near_entries(place, width, rng.normal(size=int(starts[-1])), starts, columns.astype(np.int64))
 
 
+def call_dense_entries(rng: np.random.Generator) -> None:
+    """Entries of a matrix: of images beside which another one has fields in the base."""
+    from sfm_audit.audit.kernels.joint_parts import dense_entries  # noqa: PLC0415 - in the child only
+
+    for size in (0, 1, 7, 40):
+        chosen = rng.choice(size, size // 2, replace=False).astype(np.int64)
+        dense_entries(rng.normal(size=(size, size)), chosen)
+
+
 CALLS: Final[dict[str, Callable[[np.random.Generator], None]]] = {
+    "joint_dense_entries": call_dense_entries,
     "joint_near_entries": call_near_entries,
     "witness_pair_sums": call_pair_sums,
 }

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -39,6 +38,7 @@ from sfm_audit.audit.engine.jointly import (
 from sfm_audit.audit.engine.observations import observation_table
 from sfm_audit.audit.engine.quality import quality_of_images
 from sfm_audit.audit.engine.rows import camera_columns, model_row
+from sfm_audit.audit.engine.spreading import Spread, in_turn
 from sfm_audit.audit.engine.tables import ModelAudit, Said, images_table, triage_rows
 from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
@@ -57,21 +57,6 @@ from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.evidence import NOTHING_GIVEN, Given
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
-
-T = TypeVar("T")
-
-
-class Spread(Protocol):
-    """Runs a function of an auditor and a range of images over all its images; answers in the images' order."""
-
-    def __call__(self, function: Callable[[ModelAuditor, range], list[T]], auditor: ModelAuditor) -> list[T]:
-        """Return what the function says about each image."""
-        ...
-
-
-def in_turn(function: Callable[[ModelAuditor, range], list[T]], auditor: ModelAuditor) -> list[T]:
-    """One image after the other, in this process."""
-    return function(auditor, range(len(auditor.model.images)))
 
 
 class ModelAuditor:
@@ -92,7 +77,7 @@ class ModelAuditor:
         config: AuditConfig | None = None,
         keypoint_scale_px: FloatArray | None = None,
         *,
-        spread: Spread = in_turn,
+        spread: Spread[ModelAuditor] = in_turn,
         given: Given = NOTHING_GIVEN,
     ) -> None:
         self.model, self._given, self._spread = model, given, spread
@@ -368,7 +353,7 @@ def audit_model(
     keypoint_scale_px: FloatArray | None = None,
     *,
     observations: bool = False,
-    spread: Spread = in_turn,
+    spread: Spread[ModelAuditor] = in_turn,
     given: Given = NOTHING_GIVEN,
 ) -> ModelAudit:
     """Audit all images of a model.

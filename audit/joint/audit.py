@@ -11,12 +11,13 @@ import numpy as np
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
-from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_parameters
+from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_of_cameras, implied_of_sizes
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
 from sfm_audit.audit.joint.observations import usable_images
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
 from sfm_audit.audit.joint.poses import PoseCovariance, pose_covariances, unknown_pose
 from sfm_audit.audit.joint.system import JointSystem, joint_system
+from sfm_audit.audit.kernels.threads import over_ranges, together
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import SparseModel
 
@@ -74,21 +75,25 @@ def audit_jointly(
     max_columns : of one dense system
     with_poses : whether to say how well poses are known
     """
-    parts = []
     usable = usable_images(model, residuals, sigma_px) & (True if left_out is None else ~left_out)
-    for block in covisible_blocks(model, residuals, max_columns, frame_idx, usable):
-        outside = ~block.members if left_out is None else ~block.members | left_out
-        system = joint_system(
-            model,
-            residuals,
-            sigma_px,
-            frame_idx=frame_idx,
-            image_from_frame=image_from_frame,
-            left_out=outside,
-            points_independent=points_independent,
-        )
-        parts.append(_of_block(system, block, alpha, tau_px, excluded, with_poses=with_poses))
-        del system
+    blocks = covisible_blocks(model, residuals, max_columns, frame_idx, usable)
+
+    def answers(start: int, stop: int) -> list[tuple[Block, JointAudit]]:
+        out = []
+        for block in blocks[start:stop]:
+            system = joint_system(
+                model,
+                residuals,
+                sigma_px,
+                frame_idx=frame_idx,
+                image_from_frame=image_from_frame,
+                left_out=~block.members if left_out is None else ~block.members | left_out,
+                points_independent=points_independent,
+            )
+            out.append(_of_block(system, block, alpha, tau_px, excluded, with_poses=with_poses))
+        return out
+
+    parts = [part for some in over_ranges(answers, len(blocks), range_weight=1.0) for part in some]
     return parts[0][1] if len(parts) == 1 else _merged(parts, tau_px)
 
 
@@ -116,8 +121,13 @@ def _of_block(
         gains[image], covariances[image] = own, covariance
     counts = np.diff(system.observations.offsets)
     beside = ImpliedBeside(system, steps)
-    misfit = joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)
-    implied = implied_parameters(system, steps, beside.found)
+    misfits: list[JointMisfit] = []
+    of_sizes: list[ImpliedParameter] = []
+    together(
+        lambda: misfits.append(joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)),
+        lambda: of_sizes.extend(implied_of_sizes(system, steps)),
+    )
+    misfit, implied = misfits[0], [*implied_of_cameras(system, steps, beside.found), *of_sizes]
     poses = [unknown_pose()] * len(block.core) if with_poses else []
     if with_poses:
         for image, pose in zip(core, pose_covariances(system, core, list(covariance_of.values())), strict=True):

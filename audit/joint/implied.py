@@ -116,15 +116,30 @@ def implied_parameters(
     ----------
     steps : of `own_parameters`        found : by camera, what is known already (`ImpliedBeside`)
     """
-    found = {} if found is None else found
+    return [*implied_of_cameras(system, steps, {} if found is None else found), *implied_of_sizes(system, steps)]
+
+
+def implied_of_cameras(
+    system: JointSystem, steps: tuple[CameraStep, ...], found: Mapping[int, list[ImpliedParameter]]
+) -> list[ImpliedParameter]:
+    """Return what every camera's missing parameters would be; ``found``: by camera, what is known already."""
     out: list[ImpliedParameter] = []
-    by_size: dict[tuple[int, int], list[CameraStep]] = {}
     for camera in steps:
-        if not _can_lack(system, camera):
-            continue
-        asked = _asked_of(system, camera)
-        by_size.setdefault((asked.camera.width, asked.camera.height), []).append(camera)
-        out += found[camera.camera_idx] if camera.camera_idx in found else _of_images(system, asked)
+        if camera.camera_idx in found:
+            out += found[camera.camera_idx]
+        elif _can_lack(system, camera):
+            out += _of_images(system, _asked_of(system, camera))
+    return out
+
+
+def implied_of_sizes(system: JointSystem, steps: tuple[CameraStep, ...]) -> list[ImpliedParameter]:
+    """Return a principal point common to the cameras of each image size with several of them."""
+    by_size: dict[tuple[int, int], list[CameraStep]] = {}
+    for step in steps:
+        if _can_lack(system, step):
+            camera = system.model.camera(step.camera_idx)
+            by_size.setdefault((camera.width, camera.height), []).append(step)
+    out: list[ImpliedParameter] = []
     for cameras in by_size.values():
         if len(cameras) > 1:
             record = system.model.camera(cameras[0].camera_idx)

@@ -22,7 +22,8 @@ from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 
-from sfm_audit.audit.engine.model import ModelAuditor, Spread, in_turn
+from sfm_audit.audit.engine.model import ModelAuditor
+from sfm_audit.audit.engine.spreading import Spread, in_turn
 from sfm_audit.audit.kernels import path_taken
 from sfm_audit.audit.schedule.lanes import Died, Lanes, ProcessDiedError
 
@@ -38,7 +39,7 @@ _serial = itertools.count()
 
 
 @contextmanager
-def image_processes(num_processes: int, paths: set[str] | None = None) -> Iterator[Spread]:
+def image_processes(num_processes: int, paths: set[str] | None = None) -> Iterator[Spread[ModelAuditor]]:
     """Yield a way to run a function over the images of a model: in turn, or in that many processes.
 
     paths: a set to which those processes add the path that their numbers take, compiled kernels or numpy.

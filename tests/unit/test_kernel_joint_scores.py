@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
-from sfm_audit.audit.joint import joint_misfit
+from sfm_audit.audit.joint import joint_misfit, misfit
 from sfm_audit.audit.joint.banded import BandedInverse
 from sfm_audit.audit.joint.image_scores import ScoresOfMany, image_scores, sums_of_base
 from sfm_audit.audit.joint.implied import ImpliedBeside
@@ -22,7 +22,7 @@ from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.joint_parts import in_order_of_sight, two_informations
 from sfm_audit.audit.kernels.joint_scores import Asked, JointScores, SeenArrays
-from sfm_audit.audit.kernels.threads import threads
+from sfm_audit.audit.kernels.threads import over_ranges, threads
 
 pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here: nothing to compare")
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
@@ -110,7 +110,7 @@ def test_the_bits_of_an_image_do_not_depend_on_those_beside_it(asked):
 
 
 def test_threads_change_nothing(asked, monkeypatch):
-    monkeypatch.setattr("sfm_audit.audit.kernels.threads.RANGE_WEIGHT", 100.0)
+    monkeypatch.setattr(misfit, "over_ranges", lambda of, number, weights: over_ranges(of, number, weights, 100.0))
     tau = np.full(len(asked.images), 0.2)
     alone = joint_misfit(asked.system, alpha=0.05, tau_px=tau)
     with threads(3):

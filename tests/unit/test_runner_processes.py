@@ -5,6 +5,7 @@ import os
 import pickle
 import signal
 import tempfile
+import threading
 from dataclasses import replace
 from functools import partial
 
@@ -17,8 +18,11 @@ from corpus import UNREADABLE, corpus_models
 from run_samples import make_ref, wait_for
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.engine import spreading
 from sfm_audit.audit.engine.model import ModelAuditor, audit_model
-from sfm_audit.audit.kernels.threads import threads
+from sfm_audit.audit.joint import design, misfit, normal
+from sfm_audit.audit.kernels import consistency, projection
+from sfm_audit.audit.kernels.threads import over_ranges, threads
 from sfm_audit.audit.schedule.images import image_processes, read_shared, write_shared
 from sfm_audit.audit.schedule.lanes import Died, Lanes, RemoteTracebackError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
@@ -84,10 +88,24 @@ def check_spread_changes_nothing(location, spread, **config):
 
 
 @pytest.mark.parametrize("number", [2, 5])
-def test_threads_change_nothing(scene, number):
+def test_threads_change_nothing(scene, number, monkeypatch):
+    """Of many ranges, of a few images each; the scene is too small for more than one."""
     alone = audited(scene)
+    began = []
+
+    def in_small_ranges(function, num_images, weights=None, _range_weight=None):
+        def noted(start, stop):
+            began.append(threading.current_thread().name)
+            return function(start, stop)
+
+        return over_ranges(noted, num_images, weights, 1000.0)
+
+    for module in (spreading, misfit, normal, design, consistency, projection):
+        monkeypatch.setattr(module, "over_ranges", in_small_ranges)
     with threads(number):
         together = audited(scene)
+    assert len(began) > 30
+    assert all(name.startswith("sfm-audit") for name in began)
     for name, table in alone.items():
         assert table.equals(together[name]), name
 
