@@ -55,7 +55,8 @@ OWN_ROUNDING: Final = 100.0
 MEANINGLESS: Final = 1e-3
 """A number of which numpy's own rounding moves more than that is rounding: whether it is null may differ too."""
 
-NUMBER: Final = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?|None|'?\b(null|number|nan|inf)\b'?")
+_WORD: Final = r"\b(null|number|nan|inf)\b"
+NUMBER: Final = re.compile(rf"[-+]?\d+(\.\d+)?(e[-+]?\d+)?|None|'{_WORD}'|{_WORD}")
 TABLES: Final = ("images", "cameras", "models", "observations")
 QUICK_CORPUS: Final = 2
 
@@ -93,13 +94,13 @@ def tables_of(model: SparseModel) -> ModelAudit:
         return ModelAuditor(model, AuditConfig(covariance=True)).tables(observations=True)
 
 
-def nudged(model: SparseModel) -> SparseModel:
+def nudged(model: SparseModel, seed: int = 5) -> SparseModel:
     """Return the same model for a mathematician: axes exchanged, points in another order, coordinates a last unit off.
 
     Exchanged axes change the order in which a point's coordinates in the camera are added up, whose terms may be large;
     points in another order that of the sums over them.
     """
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
 
     def moved(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         with np.errstate(all="ignore"):
@@ -124,20 +125,39 @@ def nudged(model: SparseModel) -> SparseModel:
 
 
 def compare(model: SparseModel, name: str, out: Compared) -> None:
-    """Audit a model on both paths and compare all columns."""
+    """Audit a model on both paths and compare all columns.
+
+    One nudge may leave by chance what others move a thousand times as far: before something counts as a fault, the
+    largest move of three is taken.
+    """
     with numpy_only():
-        expected, sensitive = tables_of(model), tables_of(nudged(model))
+        expected, sensitive = tables_of(model), [tables_of(nudged(model, 5))]
     found = tables_of(model)
+    told = _compared(name, (expected, found), sensitive, out.kind)
+    if told.faults:
+        with numpy_only():
+            sensitive += [tables_of(nudged(model, seed)) for seed in (6, 7)]
+        told = _compared(name, (expected, found), sensitive, out.kind)
     out.num_models += 1
     out.num_images += len(model.images)
+    out.num_values += told.num_values
+    out.num_equal += told.num_equal
+    out.num_beyond += told.num_beyond
+    out.worst = max(out.worst, told.worst)
+    out.faults += told.faults
+
+
+def _compared(name: str, both: tuple[ModelAudit, ModelAudit], nudged_ones: Sequence[ModelAudit], kind: str) -> Compared:
+    out = Compared(kind)
     for table in TABLES:
-        one, other, third = (getattr(each, table) for each in (expected, found, sensitive))
+        one, other, *others = (getattr(each, table) for each in (*both, *nudged_ones))
         if one.schema != other.schema or one.num_rows != other.num_rows:
             out.faults.append(f"{name}: {table} has other columns or rows")
             continue
         for column in one.column_names:
-            columns = [split(each[column].to_pylist(), each[column].type) for each in (one, other, third)]
+            columns = [split(each[column].to_pylist(), each[column].type) for each in (one, other, *others)]
             _compare_column(f"{column} of {name}", columns, out)
+    return out
 
 
 Column = tuple[list[Any], np.ndarray[Any, Any]]
@@ -162,12 +182,16 @@ def split(values: list[Any], kind: pa.DataType) -> Column:
 
 
 def _compare_column(where: str, columns: Sequence[Column], out: Compared) -> None:
-    """Compare one column of both paths; the third is that of the nudged model."""
-    (words, a), (other_words, b), (third_words, c) = columns
+    """Compare one column of both paths; the others are those of nudged models."""
+    (words, a), (other_words, b), *nudged_ones = columns
     out.num_values += max(len(words), len(a))
     smallest = 1.0 if where.startswith(OF_THE_ORDER_OF_ONE) else SMALLEST
-    own = float(np.max(relative_difference(a, c, smallest), initial=0.0)) if a.shape == c.shape else np.inf
-    wrong = _other_words(words, other_words, None if own > MEANINGLESS else third_words)
+    own = max(
+        float(np.max(relative_difference(a, c, smallest), initial=0.0)) if a.shape == c.shape else np.inf
+        for _, c in nudged_ones
+    )
+    wrongs = [_other_words(words, other_words, None if own > MEANINGLESS else third) for third, _ in nudged_ones]
+    wrong = None if None in wrongs else wrongs[0]
     if wrong is not None:
         out.faults.append(f"{where}: {words[wrong]!r} by numpy, {other_words[wrong]!r} by kernels")
         return

@@ -49,6 +49,8 @@ def faults_of(numpy, kernels, nudged):
         (["0.12 px"], ["0.14 px"], ["0.12 px"], 1),
         (["0.12 px"], ["0.14 px"], ["0.11 px"], 0),
         (["0.12 px"], ["nan px"], ["0.12 px"], 1),
+        ([["sd = nan"]], [["sd = 1.4e+06"]], [["sd = 1.5e+06"]], 0),
+        ([["sd = nan"]], [["sd = 1.4e+06"]], [["sd = nan"]], 1),
         ([True], [False], [False], 1),
         ([3], [4], [3], 1),
         ([["a", "b"]], [["b", "a"]], [["a", "b"]], 1),
@@ -59,6 +61,15 @@ def faults_of(numpy, kernels, nudged):
 )
 def test_what_counts_as_another_value(numpy, kernels, nudged, faults):
     assert len(faults_of(numpy, kernels, nudged).faults) == faults
+
+
+def test_the_largest_of_several_nudges_counts():
+    kind = pa.float64()
+    for values, expected in (([1.0, 2.0], 1), ([1.0, 2.0 - 1e-8], 0)):
+        out = compare_paths.Compared("some")
+        given = [1.0, 2.0], [1.0, 2.0 + 1e-8], [1.0, 2.0], values
+        compare_paths._compare_column("x of m", [compare_paths.split(each, kind) for each in given], out)
+        assert len(out.faults) == expected
 
 
 def test_values_are_counted():
