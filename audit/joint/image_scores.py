@@ -18,7 +18,7 @@ from sfm_audit.audit.joint.design import POINT
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.joint.system import Base, JointSystem
 from sfm_audit.audit.kernels.joint import FIELDS, SCALAR, JointSums
-from sfm_audit.audit.kernels.joint_scores import Asked, JointScores, Scores, SeenArrays
+from sfm_audit.audit.kernels.joint_scores import Asked, IncludedArrays, JointScores, Scores, SeenArrays
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -82,7 +82,7 @@ def image_scores(
 
 
 class ScoresOfMany:
-    """`image_scores` of many images of a base without included fields, in one call of a kernel.
+    """`image_scores` of many images in one call of a kernel.
 
     Of R and B they have the rows of the image's own columns alone: all that its tests ask for.
     """
@@ -94,13 +94,12 @@ class ScoresOfMany:
             *(model.points.xyz_world, model.observations.xy_px, residuals.residuals_px, residuals.observation_row),
             *(observations.points, observations.source),
         )
-        inverse = base.inverse.main.arrays()
-        self._kernel = JointScores(sums, observations.layout.columns, observations.transform, inverse, seen)
-
-    @staticmethod
-    def can(base: Base, sums: JointSums) -> bool:
-        """Whether nothing but S^+ of the base system stands behind the columns."""
-        return not base.included and not base.inverse.update.size and sums.repeats_follow
+        first = np.full(len(model.images), -1, dtype=np.int64)
+        for image, extra in base.included.items():
+            first[image] = int(extra.columns[0]) - len(base.inverse.main) if extra.columns.size else 0
+        included = IncludedArrays(base.inverse.update, base.inverse.border, base.inverse.corner, first)
+        given = observations.layout.columns, observations.transform, base.inverse.main.arrays()
+        self._kernel = JointScores(sums, *given, included=included, seen=seen)
 
     def scores(self, images: Sequence[int], powers: Sequence[int]) -> list[CandidateScores | None]:
         """Return the scores of some images; None where `image_scores` has to be asked, or who comes after it.
@@ -152,6 +151,11 @@ class ScoresOfMany:
             num = self._system.observations.num_of(image)
             out.append(CandidateScores(*of_fields, int(found.num_tracks[k]), *at, num, made_of[k, :, fields]))
         return out
+
+
+def scores_of_many(system: JointSystem, base: Base, sums: JointSums | None) -> ScoresOfMany | None:
+    """Return who asks about many images at once; None where each has to be asked by itself."""
+    return ScoresOfMany(system, base, sums) if sums is not None and sums.repeats_follow else None
 
 
 def _facts(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord]) -> FloatArray:

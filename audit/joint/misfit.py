@@ -14,7 +14,7 @@ from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_groups, untested
-from sfm_audit.audit.joint.image_scores import ScoresOfMany, image_scores, sums_of_base
+from sfm_audit.audit.joint.image_scores import image_scores, scores_of_many, sums_of_base
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
@@ -144,8 +144,7 @@ class _Rounds:
     ) -> None:
         num_images = len(tested)
         self._system, self._base, self._sums = system, system.base, sums_of_base(system.base)
-        can = self._sums is not None and ScoresOfMany.can(self._base, self._sums)
-        self._many = ScoresOfMany(system, self._base, self._sums) if can and self._sums is not None else None
+        self._many = scores_of_many(system, self._base, self._sums)
         self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
@@ -241,7 +240,8 @@ class _Rounds:
                 fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
                 candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
-        self._sums, self._many = sums_of_base(self._base), None
+        self._sums = sums_of_base(self._base)
+        self._many = scores_of_many(self._system, self._base, self._sums)
 
     def _touched(self, new: BoolArray) -> BoolArray:
         """(I,) images that share points with any of the new ones."""

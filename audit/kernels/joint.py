@@ -180,10 +180,18 @@ class JointSums:
         again = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
         return bool(np.count_nonzero(again) == np.count_nonzero(~self._is_first))
 
-    def most_of(self, images: IntArray) -> tuple[int, int]:
-        """Return the most rows, and the most views of points, that one of the images has."""
-        counts = np.diff(self._held["offsets"])[images]
-        return int(counts.max(initial=0)), int(self._num_views[images].max(initial=0))
+    @property
+    def extra_widths(self) -> IntArray:
+        """(I,) how many included fields each image has."""
+        widths: IntArray = self._held["extra_width"]
+        return widths
+
+    def most_of(self, images: IntArray) -> tuple[int, int, int, int]:
+        """Return the most rows, views of points and columns around that one of some images has; those of the widest."""
+        counts, views = np.diff(self._held["offsets"])[images], int(self._num_views[images].max(initial=0))
+        most = min(views, self._num_images)
+        columns = most * self.width + int(np.sort(self.extra_widths)[self._num_images - most :].sum())
+        return int(counts.max(initial=0)), views, columns, self.width + int(self.extra_widths.max(initial=0))
 
     def can(self, image_idx: int) -> bool:
         """Whether the views of an image's points are few enough to be held at once."""

@@ -36,6 +36,19 @@ class BandArrays:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class IncludedArrays:
+    """What was included since; see `sfm_audit.audit.joint.inverse.JointInverse`.
+
+    update: (D, k).    border: (D, m).    corner: (m, m).    first: (I,) an image's first column of the border, or -1.
+    """
+
+    update: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    first: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SeenArrays:
     """Where points and observations of a model are found.
 
@@ -87,6 +100,8 @@ class _Inverse(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("columns", "transform", "dense")),
         *((name, ctypes.c_int64) for name in ("band_width", "num_blocks", "num_null")),
         *((name, ctypes.c_void_p) for name in ("place", "starts", "block_columns", "near", "null", "pull", "scale")),
+        *((name, ctypes.c_int64) for name in ("num_update", "num_extra")),
+        *((name, ctypes.c_void_p) for name in ("update", "border", "corner", "extra_column")),
     )
 
 
@@ -100,7 +115,7 @@ class _Seen(ctypes.Structure):
 
 
 class JointScores:
-    """Asks the kernel about images of one base without included fields; several threads may ask at once."""
+    """Asks the kernel about images of one base; several threads may ask at once."""
 
     def __init__(
         self,
@@ -108,6 +123,8 @@ class JointScores:
         columns: IntArray,
         transform: FloatArray,
         inverse: FloatArray | BandArrays,
+        *,
+        included: IncludedArrays,
         seen: SeenArrays,
     ) -> None:
         self._sums, width = sums, sums.width
@@ -124,6 +141,7 @@ class JointScores:
             self._take_band(inverse, size)
         else:
             self._inverse.dense = self._kept(doubles(inverse, (size, size)))
+        self._take_included(included, size)
         self._seen = self._checked(seen)
         self._inverse.held = self._seen.held = self._held  # whoever keeps the addresses keeps the arrays
 
@@ -162,6 +180,18 @@ class JointScores:
         for name, array in {**given, "scale": doubles(band.scale, (size,))}.items():
             setattr(self._inverse, name, self._kept(array))
 
+    def _take_included(self, included: IncludedArrays, size: int) -> None:
+        num_update, num_extra = included.update.shape[1], included.border.shape[1]
+        first = ints(included.first, self._sums.num_images)
+        width = self._sums.extra_widths
+        if not ((width == 0) | ((first >= 0) & (first + width <= num_extra))).all():
+            raise ValueError(f"first: included fields lie outside of {num_extra} columns")
+        self._inverse.num_update, self._inverse.num_extra = num_update, num_extra
+        self._inverse.update = self._kept(doubles(included.update, (size, num_update)))
+        self._inverse.border = self._kept(doubles(included.border, (size, num_extra)))
+        self._inverse.corner = self._kept(doubles(included.corner, (num_extra, num_extra)))
+        self._inverse.extra_column = self._kept(first)
+
     def _checked(self, seen: SeenArrays) -> _Seen:
         num = seen.observation_row.size
         row = small_ints(seen.observation_row, num)
@@ -182,7 +212,9 @@ class JointScores:
 
     def of(self, asked: Asked) -> Scores | None:
         """Return what the tests of some images need; None without kernels."""
-        function = kernel("joint_scores", *([ctypes.c_void_p] * 3), Size, Ints, Doubles, Ints, Ints, Size, Size, *_OUT)
+        function = kernel(
+            "joint_scores", *([ctypes.c_void_p] * 3), Size, Ints, Doubles, Ints, Ints, *([Size] * 4), *_OUT
+        )
         k, width = len(asked.images), self._sums.width
         images = ints(asked.images, k)
         if function is None or (k and not (images.min() >= 0 and images.max() < self._sums.num_images)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,15 +15,20 @@ from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.joint import joint_misfit, misfit
 from sfm_audit.audit.joint.banded import BandedInverse
+from sfm_audit.audit.joint.candidates import candidate_scores
+from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.image_scores import ScoresOfMany, image_scores, sums_of_base
 from sfm_audit.audit.joint.implied import ImpliedBeside
+from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.observations import _in_order_of_sight, joint_observations
 from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.joint_parts import in_order_of_sight, two_informations
-from sfm_audit.audit.kernels.joint_scores import Asked, JointScores, SeenArrays
+from sfm_audit.audit.kernels.joint_scores import Asked, IncludedArrays, JointScores, SeenArrays
 from sfm_audit.audit.kernels.threads import over_ranges, threads
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
+from sfm_audit.audit.table.words import MisfitGroup
 
 pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here: nothing to compare")
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
@@ -64,7 +70,7 @@ def asked(request):
         options = {"frame_idx": frames.frame_idx, "image_from_frame": frames.image_from_frame}
     system = joint_system(model, auditor.residuals, auditor.sigma_constant_px, **options)
     sums = sums_of_base(system.base)
-    assert ScoresOfMany.can(system.base, sums)
+    assert sums.repeats_follow
     return SimpleNamespace(
         name=request.param,
         system=system,
@@ -75,12 +81,30 @@ def asked(request):
     )
 
 
-def test_many_images_have_the_scores_of_one(asked):
+@pytest.fixture(scope="module", params=[False, True], ids=["as it was", "with included fields"])
+def beside(asked, request):
+    """A base, its sums, and who asks it about many images."""
+    base = asked.system.base
+    if not request.param:
+        return base, asked.sums, asked.many
+    group, candidates = GROUP_COLUMNS[MisfitGroup.ROLLING_SHUTTER], []
+    for image in (3, 1, 4):
+        fields = misfit._fields_of(asked.system, image)
+        root = group_root(candidate_scores(base, [image], lambda _, own=fields: own), group)
+        nuisance = partial(asked.system.observations.nuisance, image)
+        candidates.append(Candidate(image, fields.fields[:, :, group] @ root.T, nuisance))
+    base = include(include(base, candidates[:2]), candidates[2:])
+    sums = sums_of_base(base)
+    return base, sums, ScoresOfMany(asked.system, base, sums)
+
+
+def test_many_images_have_the_scores_of_one(asked, beside):
+    base, sums, many = beside
     powers = [asked.beside.power(image) for image in asked.images]
     layout = asked.system.observations.layout
-    assert isinstance(asked.system.base.inverse.main, BandedInverse) == (asked.name == "street")
-    for image, power, found in zip(asked.images, powers, asked.many.scores(asked.images, powers), strict=True):
-        expected = image_scores(asked.system, asked.system.base, asked.sums, image, power)
+    assert isinstance(base.inverse.main, BandedInverse) == (asked.name == "street")
+    for image, power, found in zip(asked.images, powers, many.scores(asked.images, powers), strict=True):
+        expected = image_scores(asked.system, base, sums, image, power)
         assert (found is None) == (expected is None) == (asked.name == "FULL_OPENCV")
         if found is None:
             continue
@@ -99,11 +123,11 @@ def test_many_images_have_the_scores_of_one(asked):
         assert (found.num_tracks, found.num_observations) == (expected.num_tracks, expected.num_observations)
 
 
-def test_the_bits_of_an_image_do_not_depend_on_those_beside_it(asked):
-    powers = [asked.beside.power(image) for image in asked.images]
-    together = asked.many.scores(asked.images, powers)
+def test_the_bits_of_an_image_do_not_depend_on_those_beside_it(asked, beside):
+    powers, many = [asked.beside.power(image) for image in asked.images], beside[2]
+    together = many.scores(asked.images, powers)
     for image, power, one in zip(asked.images, powers, together, strict=True):
-        (alone,) = asked.many.scores([image], [power])
+        (alone,) = many.scores([image], [power])
         if one is not None:
             for name in ("sq_length", "gram", "score", "meat", "solution"):
                 assert getattr(alone, name).tobytes() == getattr(one, name).tobytes(), name
@@ -136,14 +160,21 @@ def test_a_band_that_does_not_reach_is_left_to_numpy(asked):
     rows = np.minimum(width, size - width * np.arange(len(arrays.columns)))
     near = np.concatenate([block[:, :own].ravel() for block, own in zip(main.near, rows.tolist(), strict=True)])
     short = dataclasses.replace(arrays, near=near, columns=rows, starts=np.cumsum([0, *rows**2]))
-    given = asked.sums, observations.layout.columns, observations.transform
-    asked.many._kernel = JointScores(*given, short, seen_of(asked.system))
+    given, behind = (asked.sums, observations.layout.columns, observations.transform), behind_of(asked.system)
+    asked.many._kernel = JointScores(*given, short, **behind)
     found = asked.many.scores(asked.images, [0] * len(asked.images))
-    asked.many._kernel = JointScores(*given, arrays, seen_of(asked.system))
+    asked.many._kernel = JointScores(*given, arrays, **behind)
     assert any(each is None for each in found)
     for changes in ({"width": width + 1}, {"place": arrays.place + 1}, {"near": near}, {"starts": arrays.starts + 1}):
         with pytest.raises(ValueError, match="another band"):
-            JointScores(*given, dataclasses.replace(arrays, **changes), seen_of(asked.system))
+            JointScores(*given, dataclasses.replace(arrays, **changes), **behind)
+
+
+def behind_of(system):
+    inverse = system.base.inverse
+    first = np.full(len(system.model.images), -1)
+    included = IncludedArrays(inverse.update, inverse.border, inverse.corner, first)
+    return {"included": included, "seen": seen_of(system)}
 
 
 def seen_of(system, **changes):
@@ -162,17 +193,25 @@ def test_indices_that_lead_outside_never_reach_the_kernel():
     system = system_of(model_of(SPEC, seed=1))
     sums, layout = sums_of_base(system.base), system.observations.layout
     inverse = system.base.inverse.main.arrays()
+    included = behind_of(system)["included"]
     given = sums, layout.columns, system.observations.transform, inverse
     for name in ("observation_row", "points", "source"):
         index = getattr(seen_of(system), name)
         for bad in (-1, 10**9):
             with pytest.raises(ValueError, match=f"{name}: expected 0"):
-                JointScores(*given, seen_of(system, **{name: np.where(np.arange(index.size) == 3, bad, index)}))
+                JointScores(
+                    *given,
+                    included=included,
+                    seen=seen_of(system, **{name: np.where(np.arange(index.size) == 3, bad, index)}),
+                )
     with pytest.raises(ValueError, match="expected an array of shape"):
-        JointScores(*given, seen_of(system, residuals_px=np.zeros((2, 3))))
+        JointScores(*given, included=included, seen=seen_of(system, residuals_px=np.zeros((2, 3))))
     with pytest.raises(ValueError, match="columns: expected 0"):
-        JointScores(sums, layout.columns + 1000, *given[2:], seen_of(system))
-    kernel = JointScores(*given, seen_of(system))
+        JointScores(sums, layout.columns + 1000, *given[2:], included=included, seen=seen_of(system))
+    outside = dataclasses.replace(included, update=np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="expected an array of shape"):
+        JointScores(*given, included=outside, seen=seen_of(system))
+    kernel = JointScores(*given, included=included, seen=seen_of(system))
     one = np.zeros(1, dtype=np.int64)
     assert kernel.of(Asked(one - 1, np.zeros((1, 27)), one, one)) is None
     assert kernel.of(Asked(one + len(layout.columns), np.zeros((1, 27)), one, one)) is None

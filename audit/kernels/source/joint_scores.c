@@ -14,6 +14,10 @@ typedef struct {
     const int64_t *place;      /* (size) of each column */
     const int64_t *starts, *block_columns;
     const double *near, *null, *pull, *scale;
+    /* what was included since: S^+ + U U^T, its border (size, num_extra) and corner (num_extra, num_extra) */
+    int64_t num_update, num_extra;
+    const double *update, *border, *corner;
+    const int64_t *extra_column; /* (I) first of an image's included fields in the border */
 } base_inverse;
 
 /* Where the points, and what was observed, are found. */
@@ -25,7 +29,7 @@ typedef struct {
 } seen_points;
 
 typedef struct {
-    int64_t key, row;
+    int64_t key, row, column;
 } keyed;
 
 static int by_key(const void *left, const void *right) {
@@ -102,8 +106,7 @@ static inline __attribute__((always_inline)) int times_inverse(
             add_product(rows, columns, tile, scaled + FIELDS * j, out + FIELDS * i);
         }
     }
-    if (s->dense) return 1;
-    for (int64_t k = 0; k < s->num_null; k++) {
+    for (int64_t k = 0; !s->dense && k < s->num_null; k++) {
         double of_null[FIELDS] = {0.0}, of_pull[FIELDS] = {0.0};
         for (int64_t i = 0; i < num; i++) {
             add_row(of_null, s->null[key[i].key * s->num_null + k], scaled + FIELDS * i);
@@ -114,10 +117,33 @@ static inline __attribute__((always_inline)) int times_inverse(
             add_row(out + FIELDS * i, -s->pull[key[i].key * s->num_null + k], of_null);
         }
     }
-    for (int64_t i = 0; i < num; i++) {
+    for (int64_t i = 0; !s->dense && i < num; i++) {
         for (int c = 0; c < FIELDS; c++) out[FIELDS * i + c] *= s->scale[column[i]];
     }
     return 1;
+}
+
+/* What included fields add to out (num + num_extra, FIELDS): U U^T, border and corner, at num columns of the base and those of
+ * num_extra included fields behind them. */
+static inline __attribute__((always_inline)) void add_included(
+    const base_inverse *s, const int64_t *column, int64_t num, int64_t num_extra, const double *from, double *out) {
+    const int64_t *extra = column + num;
+    memset(out + FIELDS * num, 0, (size_t)(num_extra * FIELDS) * sizeof *out);
+    for (int64_t k = 0; k < s->num_update; k++) {
+        double along[FIELDS] = {0.0};
+        for (int64_t i = 0; i < num; i++) add_row(along, s->update[column[i] * s->num_update + k], from + FIELDS * i);
+        for (int64_t i = 0; i < num; i++) add_row(out + FIELDS * i, s->update[column[i] * s->num_update + k], along);
+    }
+    for (int64_t e = 0; e < num_extra; e++) {
+        for (int64_t i = 0; i < num; i++) {
+            double x = s->border[column[i] * s->num_extra + extra[e]];
+            add_row(out + FIELDS * i, x, from + FIELDS * (num + e));
+            add_row(out + FIELDS * (num + e), x, from + FIELDS * i);
+        }
+        for (int64_t f = 0; f < num_extra; f++) {
+            add_row(out + FIELDS * (num + e), s->corner[extra[e] * s->num_extra + extra[f]], from + FIELDS * (num + f));
+        }
+    }
 }
 
 /* out (FIELDS, FIELDS) += sign times left^T right, both (num, FIELDS). */
@@ -181,54 +207,68 @@ static int64_t number_tracks(const joint_model *m, int64_t first, int64_t n, int
     return count;
 }
 
-/* Order the columns around an image: keys ascending, column (num) of each; position (rows) of each row of right, -1 without
- * a column. Returns how many distinct columns there are. */
-static int64_t order_columns(const base_inverse *s, const workspace *w, int64_t num_around) {
-    int64_t rows = 0, count = 0;
+/* Order the columns around an image: keys ascending, column of each, those of included fields behind them; position of each row
+ * of right, -1 without a column. num: how many distinct columns the base has here, and how many included fields. */
+static void order_columns(const joint_model *m, const base_inverse *s, const workspace *w, int64_t num_around, int64_t *num) {
+    int64_t rows = 0, count = 0, row = 0, extra = 0;
     for (int64_t k = 0; k < num_around; k++) {
-        for (int64_t c = 0; c < s->width; c++) {
-            int64_t column = s->columns[w->around[k] * s->width + c], row = k * s->width + c;
+        for (int64_t c = 0; c < s->width; c++, row++) {
+            int64_t column = s->columns[w->around[k] * s->width + c];
             w->position[row] = -1;
-            if (column < s->size) w->keys[rows++] = (keyed){s->dense ? column : s->place[column], row};
+            if (column < s->size) w->keys[rows++] = (keyed){s->dense ? column : s->place[column], row, column};
         }
+        row += m->extra_width[w->around[k]];
     }
     qsort(w->keys, (size_t)rows, sizeof *w->keys, by_key);
     for (int64_t r = 0; r < rows; r++) {
         keyed here = w->keys[r];
-        if (!count || w->keys[count - 1].key != here.key) {
-            w->column[count] = s->columns[w->around[here.row / s->width] * s->width + here.row % s->width];
-            w->keys[count++] = here;
-        }
+        if (!count || w->keys[count - 1].key != here.key) w->column[count] = here.column, w->keys[count++] = here;
         w->position[here.row] = count - 1;
     }
-    return count;
+    row = 0;
+    for (int64_t k = 0; k < num_around; k++) {
+        row += s->width;
+        for (int64_t e = 0; e < m->extra_width[w->around[k]]; e++, row++, extra++) {
+            w->column[count + extra] = s->extra_column[w->around[k]] + e;
+            w->position[row] = count + extra;
+        }
+    }
+    num[0] = count, num[1] = extra;
 }
 
-/* ordered (num, FIELDS): T^T right of each image around, summed by column. */
-INLINE void collect_columns(const base_inverse *s, const workspace *w, int64_t num_around, int64_t num) {
+/* ordered (num, FIELDS): T^T right of each image around, summed by column; rows of included fields as they are. */
+INLINE void collect_columns(const joint_model *m, const base_inverse *s, const workspace *w, int64_t num_around, int64_t num) {
     memset(w->ordered, 0, (size_t)(num * FIELDS) * sizeof(double));
-    for (int64_t k = 0; k < num_around; k++) {
-        const double *t = s->transform + w->around[k] * s->width * s->width, *right = w->right + k * s->width * FIELDS;
+    for (int64_t k = 0, row = 0; k < num_around; k++) {
+        const double *t = s->transform + w->around[k] * s->width * s->width, *right = w->right + row * FIELDS;
         for (int64_t d = 0; d < s->width; d++) {
-            int64_t to = w->position[k * s->width + d];
+            int64_t to = w->position[row + d];
             for (int64_t c = 0; c < s->width && to >= 0; c++) {
                 if (t[c * s->width + d] != 0.0) add_row(w->ordered + FIELDS * to, t[c * s->width + d], right + FIELDS * c);
             }
         }
+        row += s->width;
+        for (int64_t e = 0; e < m->extra_width[w->around[k]]; e++, row++) {
+            add_row(w->ordered + FIELDS * w->position[row], 1.0, w->right + row * FIELDS);
+        }
     }
 }
 
-/* moved (rows, FIELDS): T times the solution of each image around. */
-INLINE void spread_columns(const base_inverse *s, const workspace *w, int64_t num_around) {
-    memset(w->moved, 0, (size_t)(num_around * s->width * FIELDS) * sizeof(double));
-    for (int64_t k = 0; k < num_around; k++) {
+/* moved (rows, FIELDS): T times the solution of each image around; rows of included fields as they are. */
+INLINE void spread_columns(const joint_model *m, const base_inverse *s, const workspace *w, int64_t num_around, int64_t num_rows) {
+    memset(w->moved, 0, (size_t)(num_rows * FIELDS) * sizeof(double));
+    for (int64_t k = 0, row = 0; k < num_around; k++) {
         const double *t = s->transform + w->around[k] * s->width * s->width;
-        double *moved = w->moved + k * s->width * FIELDS;
+        double *moved = w->moved + row * FIELDS;
         for (int64_t c = 0; c < s->width; c++) {
             for (int64_t d = 0; d < s->width; d++) {
-                int64_t from = w->position[k * s->width + d];
+                int64_t from = w->position[row + d];
                 if (from >= 0 && t[c * s->width + d] != 0.0) add_row(moved + FIELDS * c, t[c * s->width + d], w->solution + FIELDS * from);
             }
+        }
+        row += s->width;
+        for (int64_t e = 0; e < m->extra_width[w->around[k]]; e++, row++) {
+            add_row(w->moved + row * FIELDS, 1.0, w->solution + FIELDS * w->position[row]);
         }
     }
 }
@@ -243,19 +283,20 @@ static void look_up(const joint_model *m, const seen_points *p, int64_t first, i
     }
 }
 
-/* What the tests of some images need of their 44 candidate functions; no image around has included fields.
+/* What the tests of some images need of their 44 candidate functions.
  *
- * images (num); facts (num, 27), is_fisheye, power (num): as joint_fields has them.    most_rows, most_views: of these images.
+ * images (num); facts (num, 27), is_fisheye, power (num): as joint_fields has them.    most_rows, most_views, most_columns:
+ * of these images, of the views of their points, and of design and included fields around.    widest: most columns of one image.
  * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12, 12): w E^T E; score (44); right,
  * solution (width, 44): R and B at its own columns, zero where it has none. */
 WIDE KERNEL int64_t joint_scores(
     const joint_model *m, const base_inverse *s, const seen_points *p, int64_t num, const int64_t *images, const double *facts,
-    const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t *status, int64_t *num_tracks,
+    const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t most_columns, int64_t widest, int64_t *status, int64_t *num_tracks,
     double *gram, double *meat, double *plain, double *dense_plain, double *score, double *right, double *solution) {
-    int64_t most_around = most_views < m->num_images ? most_views : m->num_images, width = m->width;
+    int64_t width = m->width;
     workspace w;
-    w.most_rows = most_rows, w.most_views = most_views, w.most_columns = most_around * width;
-    if (!has_room(&w, m->num_images, width)) {
+    w.most_rows = most_rows, w.most_views = most_views, w.most_columns = most_columns;
+    if (!has_room(&w, m->num_images, widest)) {
         leave(&w);
         return NO_MEMORY;
     }
@@ -271,25 +312,27 @@ WIDE KERNEL int64_t joint_scores(
         status[k] = joint_first(
             m, w.place, image, w.scalar, w.dense, w.track, num_tracks[k], w.most_columns, w.view, w.own, w.around, w.start, found,
             w.absorbing, w.right, g, plain + k * SCALAR * SCALAR, dense_plain + k * DENSE * DENSE, score + k * FIELDS,
-            w.track_score, w.scores, most_views * width);
+            w.track_score, w.scores, most_views * widest);
         if (status[k] != DONE) continue;
-        int64_t count = order_columns(s, &w, found[0]);
-        collect_columns(s, &w, found[0], count);
-        if (!times_inverse(s, w.keys, w.column, count, w.ordered, w.scaled, w.solution)) {
+        int64_t count[2];
+        order_columns(m, s, &w, found[0], count);
+        collect_columns(m, s, &w, found[0], count[0] + count[1]);
+        if (!times_inverse(s, w.keys, w.column, count[0], w.ordered, w.scaled, w.solution)) {
             status[k] = NEEDS_NUMPY;
             continue;
         }
-        spread_columns(s, &w, found[0]);
+        add_included(s, w.column, count[0], count[1], w.ordered, w.solution);
+        spread_columns(m, s, &w, found[0], found[1]);
         joint_second(m, found[0], w.own, w.around, w.start, w.track, w.scores, w.moved, w.track_score);
-        add_products(count, w.ordered, w.solution, -1.0, g);
+        add_products(count[0] + count[1], w.ordered, w.solution, -1.0, g);
         for (int64_t a = 0; a < FIELDS; a++) {
             for (int64_t b = 0; b < a; b++) g[FIELDS * a + b] = g[FIELDS * b + a] = 0.5 * (g[FIELDS * a + b] + g[FIELDS * b + a]);
         }
         memset(v, 0, FIELDS * FIELDS * sizeof *v);
         add_products(num_tracks[k], w.track_score, w.track_score, 1.0, v);
-        for (int64_t j = 0; j < found[0]; j++) {
+        for (int64_t j = 0, row = 0; j < found[0]; row += width + m->extra_width[w.around[j]], j++) {
             for (int64_t c = 0; w.around[j] == image && c < width; c++) {
-                int64_t from = w.position[j * width + c], at = (k * width + c) * FIELDS;
+                int64_t from = w.position[row + c], at = (k * width + c) * FIELDS;
                 if (from < 0) continue;
                 memcpy(right + at, w.ordered + FIELDS * from, FIELDS * sizeof *right);
                 memcpy(solution + at, w.solution + FIELDS * from, FIELDS * sizeof *solution);
