@@ -107,8 +107,10 @@ def _of_block(
     with_poses: bool,
 ) -> tuple[Block, JointAudit]:
     core = np.flatnonzero(block.core).tolist()
-    covariance_of = dict(zip(core, system.image_covariances(core), strict=True))
-    steps = own_parameters(system, covariance_of)
+    asked = np.flatnonzero(block.core | block.members).tolist()  # of all members: their cameras have steps, too
+    covariances_of_members = dict(zip(asked, system.image_covariances(asked), strict=True))
+    steps = own_parameters(system, covariances_of_members)
+    covariance_of = {image: covariances_of_members[image] for image in core}
     out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
     material = [step for step in steps if step.is_material(float(np.median(tau_px[step.image_idxs])))]
     for step in material:

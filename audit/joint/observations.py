@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -142,22 +142,22 @@ def joint_observations(
     their observations are left out of everything; so are those of ``left_out`` (I,). Points with fewer than two
     views left or with a singular V (two rays that are parallel) are left out with their observations.
     """
-    counts = np.diff(residuals.offsets)
-    used = usable_images(model, residuals, sigma_px) & _finite_images(residuals)
+    used = usable_images(model, residuals, sigma_px)
     used &= ~left_out if left_out is not None else True
-    weight = _weights(residuals, np.where(used, sigma_px, np.nan), counts)
-    in_use = np.repeat(used, counts)
+    candidates = _Candidates.of(residuals, used)
+    used[candidates.image_idx[~np.isfinite(candidates.jacobian.sum(axis=(0, 1)))]] = False
+    weight = candidates.weights(sigma_px)
+    in_use = used[candidates.image_idx]
     if not points_independent:
-        in_use &= _regular_points(residuals, np.where(in_use, weight, 0.0), len(model.points))[residuals.point_idx]
+        in_use &= candidates.have_regular_points(np.where(in_use, weight, 0.0), len(model.points))
     layout = make_layout(model, used, frame_idx, image_from_frame)
-    source = np.flatnonzero(in_use)
-    image_idx = np.repeat(np.arange(len(counts)), counts)[source]
-    offsets = np.searchsorted(image_idx, np.arange(len(counts) + 1)).astype(np.int64)
-    seen = residuals.point_idx[source]
+    image_idx, seen = candidates.image_idx[in_use], candidates.point_idx[in_use]
+    num_images = len(model.images)
+    offsets = np.searchsorted(image_idx, np.arange(num_images + 1)).astype(np.int64)
     sight = (
         _each_by_itself(seen) if points_independent else _in_order_of_sight(image_idx, seen, offsets, len(model.points))
     )
-    source = source[sight.order]
+    source = candidates.rows[in_use][sight.order]
     return JointObservations(
         model,
         residuals,
@@ -169,9 +169,9 @@ def joint_observations(
         sight.point_idx,
         make_design(model, residuals, layout, source, offsets),
         _transforms(model, layout),
-        weight[source],
+        weight[in_use][sight.order],
         sigma_px,
-        _rms_px(residuals, counts),
+        candidates.rms_px(num_images),
         sight.by_point,
         sight.point_offsets,
         points_independent,
@@ -218,41 +218,57 @@ def design_scores(design: FloatArray, weight: FloatArray, left_px: FloatArray) -
     return np.asarray(np.einsum("nac,na->nc", design, left_px * weight[:, None]))
 
 
-def _finite_images(residuals: ModelResiduals) -> BoolArray:
-    """(I,) images whose derivatives in the points are all finite."""
-    bad = ~np.isfinite(residuals.point_jacobian.sum(axis=(0, 1)))
-    sums = np.concatenate([[0], np.cumsum(bad)])
-    return np.asarray(sums[residuals.offsets[1:]] == sums[residuals.offsets[:-1]])
+class _Candidates(NamedTuple):
+    """Inliers of the images that may take part: of a block of a large model a small part.
 
+    rows: (n,) columns of ModelResiduals.    image_idx, point_idx: (n,) rows of their tables.    jacobian: (2, 3, n).
+    sq_length_px2: (n,) of the residuals.
+    """
 
-def _weights(residuals: ModelResiduals, sigma_px: FloatArray, counts: IntArray) -> FloatArray:
-    """Return w / s^2 of all inliers; NaN without noise."""
-    sigma = np.repeat(sigma_px, counts)
-    length = np.sqrt((residuals.residuals_px**2).sum(axis=0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        robust = np.minimum(1.0, _HUBER * sigma / length)
-    robust[length == 0] = 1.0
-    return np.asarray(robust / sigma**2)
+    rows: IntArray
+    image_idx: IntArray
+    point_idx: IntArray
+    jacobian: FloatArray
+    sq_length_px2: FloatArray
 
+    @classmethod
+    def of(cls, residuals: ModelResiduals, used: BoolArray) -> _Candidates:
+        counts = np.diff(residuals.offsets)
+        rows = np.flatnonzero(np.repeat(used, counts))
+        image_idx = np.repeat(np.flatnonzero(used), counts[used])
+        jacobian, residuals_px, point_idx = residuals.point_jacobian, residuals.residuals_px, residuals.point_idx
+        if rows.size < point_idx.size:
+            jacobian, residuals_px, point_idx = jacobian[:, :, rows], residuals_px[:, rows], point_idx[rows]
+        return cls(rows, image_idx, point_idx, jacobian, (residuals_px**2).sum(axis=0))
 
-def _rms_px(residuals: ModelResiduals, counts: IntArray) -> FloatArray:
-    """(I,) root mean square length of all inliers' residuals, NaN without any."""
-    image = np.repeat(np.arange(len(counts)), counts)  # by image: differences of a running sum lose what is small
-    sq_px2 = (residuals.residuals_px**2).sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.sqrt(np.bincount(image, sq_px2, len(counts)) / counts))
+    def weights(self, sigma_px: FloatArray) -> FloatArray:
+        """(n,) w / s^2."""
+        sigma, length = sigma_px[self.image_idx], np.sqrt(self.sq_length_px2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            robust = np.minimum(1.0, _HUBER * sigma / length)
+        robust[length == 0] = 1.0
+        return np.asarray(robust / sigma**2)
 
+    def rms_px(self, num_images: int) -> FloatArray:
+        """(I,) root mean square length of all inliers' residuals, NaN without any."""
+        # by image: differences of a running sum lose what is small
+        total, counts = (np.bincount(self.image_idx, of, num_images) for of in (self.sq_length_px2, None))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.sqrt(total / counts))
 
-def _regular_points(residuals: ModelResiduals, weight: FloatArray, num_points: int) -> BoolArray:
-    """(P,) points with two views or more whose V can be inverted."""
-    information = point_information(residuals.point_jacobian, weight, residuals.point_idx, num_points)
-    views = np.bincount(residuals.point_idx[weight > 0], minlength=num_points)
-    determinants = kernels.unit_determinants(information, smallest=_SMALLEST_SQUARE, invert=False)
-    if determinants is not None:
-        return np.asarray((views >= _MIN_VIEWS) & (determinants > _SINGULAR_POINT))
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), _SMALLEST_SQUARE))
-    unit = information / scale[:, :, None] / scale[:, None, :]
-    return np.asarray((views >= _MIN_VIEWS) & (np.linalg.det(unit) > _SINGULAR_POINT))
+    def have_regular_points(self, weight: FloatArray, num_points: int) -> BoolArray:
+        """(n,) whether the point has two views or more, and a V that can be inverted."""
+        seen = np.zeros(num_points, dtype=bool)
+        seen[self.point_idx] = True
+        num_seen = int(np.count_nonzero(seen))
+        point_idx = self.point_idx if num_seen == num_points else (np.cumsum(seen) - 1)[self.point_idx]
+        information = point_information(self.jacobian, weight, point_idx, num_seen)
+        views = np.bincount(point_idx[weight > 0], minlength=num_seen)
+        determinants = kernels.unit_determinants(information, smallest=_SMALLEST_SQUARE, invert=False)
+        if determinants is None:
+            scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), _SMALLEST_SQUARE))
+            determinants = np.linalg.det(information / scale[:, :, None] / scale[:, None, :])
+        return np.asarray(((views >= _MIN_VIEWS) & (determinants > _SINGULAR_POINT))[point_idx])
 
 
 def point_information(jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
