@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, with_param
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.joint import joint_system, own_parameters
-from sfm_audit.audit.joint.again import implied_again
+from sfm_audit.audit.joint.again import _State, implied_again
 from sfm_audit.loaders.model import SparseModel
 
 SMALL = dataclasses.replace(SPEC, num_images=12, points_per_image=150)
@@ -46,3 +46,23 @@ def test_an_optimum_stays_and_independent_points_keep_the_linear_value(adjusted)
     assert implied_again(system, []) == []
     independent, steps = steps_of(adjusted, points_independent=True)
     assert implied_again(independent, steps) == list(steps)
+
+
+def test_points_in_another_order_move_by_steps_of_their_own(adjusted):
+    """The system numbers points in the order of sight, whatever their rows are."""
+    wrong = with_param(adjusted, 5, 0, adjusted.camera(5).params[0] + 50.0)
+    order = np.random.default_rng(0).permutation(len(wrong.points))
+    points = type(wrong.points)(*(getattr(wrong.points, f.name)[order] for f in dataclasses.fields(wrong.points)))
+    point_idx = np.argsort(order)[wrong.observations.point_idx]
+    observations = dataclasses.replace(wrong.observations, point_idx=point_idx)
+    shuffled = dataclasses.replace(wrong, points=points, observations=observations)
+    found, expected = (moved_points(steps_of(model)[0]) for model in (shuffled, wrong))
+    assert_allclose(found, expected[order], atol=1e-6)
+    assert np.abs(expected - wrong.points.xyz_world).max() > 0.1
+
+
+def moved_points(system):
+    base = system.base
+    return (
+        _State(system.model, system.residuals, system.observations, base.step, base.point_step).moved().points.xyz_world
+    )

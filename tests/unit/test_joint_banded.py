@@ -15,7 +15,7 @@ from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
-from sfm_audit.audit.joint.own import walds
+from sfm_audit.audit.joint.own import _walds, walds
 
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
 
@@ -137,7 +137,9 @@ def test_blocks_of_columns_that_lie_apart_have_the_same_covariance(street):
 
 def test_blocks_of_many_images_are_those_of_one(street, dense):
     columns = street.observations.layout.columns[:, :8]
-    far = np.concatenate([columns[:1, :4], columns[-1:, :4]], axis=1)
+    order = street.base.inverse.main.factor.band.order
+    far = np.concatenate([order[:4], order[-4:]])[None]
+    assert not street.base.inverse.main._is_near(far[0])
     asked = np.concatenate([columns, far])
     for main in (street.base.inverse.main, dense.main):
         for found, each in zip(main.blocks(asked), asked, strict=True):
@@ -162,3 +164,10 @@ def test_what_a_step_gains_is_its_wald_statistic(street):
     own = steps[1, left] @ np.linalg.solve(blocks[1][np.ix_(left, left)], steps[1, left])
     assert_allclose(walds(less, columns, steps), [expected[0], own, expected[2]], rtol=1e-6)
     assert walds(street, columns[:0], steps[:0]).shape == (0,)
+
+
+def test_a_direction_that_nothing_holds_gains_nothing():
+    """Two parameters that only move together: rounding must not make a direction of their difference."""
+    blocks = np.array([[[1.0, 1.0], [1.0, 1.0]]])
+    found = _walds(np.repeat(blocks, 2, axis=0), np.ones((2, 2), dtype=bool), np.array([[1.0, 1.0], [1.0, -1.0]]))
+    assert_allclose(found, [1.0, 0.0], atol=1e-9)

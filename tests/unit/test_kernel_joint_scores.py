@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
+from sfm_audit.audit.joint import image_scores as image_score_module
 from sfm_audit.audit.joint import joint_misfit, misfit
 from sfm_audit.audit.joint.banded import BandedInverse
 from sfm_audit.audit.joint.candidates import candidate_scores
@@ -149,6 +150,16 @@ def test_a_rolling_shutter_over_no_rows_is_left_to_numpy(asked):
     many = ScoresOfMany(flat, asked.system.base, asked.sums)
     assert many.scores(asked.images, [0] * len(asked.images)) == [None] * len(asked.images)
     assert many.scores([], []) == []
+
+
+@pytest.mark.parametrize("least", [0.0, 10.0])
+def test_fields_whose_functions_all_but_cancel_are_left_to_numpy(asked, least, monkeypatch):
+    """No model here has any: every field has less than ten times its functions' squares, and none less than nothing."""
+    monkeypatch.setattr(image_score_module, "_LEFT_OF_TERMS", least)
+    found = asked.many.scores(asked.images, [0] * len(asked.images))
+    single = [image_scores(asked.system, asked.system.base, asked.sums, image, 0) for image in asked.images]
+    is_none = least > 0.0 or asked.name == "FULL_OPENCV"
+    assert [each is None for each in (*found, *single)] == [is_none] * 2 * len(asked.images)
 
 
 def test_a_band_that_does_not_reach_is_left_to_numpy(asked):

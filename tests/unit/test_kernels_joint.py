@@ -16,7 +16,7 @@ from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.joint import audit_jointly, misfit
 from sfm_audit.audit.joint.candidates import FieldsInParts, candidate_scores
 from sfm_audit.audit.joint.group_test import group_root
-from sfm_audit.audit.joint.image_scores import image_scores, sums_of_base
+from sfm_audit.audit.joint.image_scores import image_scores, scores_of_many, sums_of_base
 from sfm_audit.audit.joint.implied import ImpliedBeside, _shift_fields
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
@@ -285,6 +285,9 @@ def test_an_image_without_observations_has_nothing_around():
     assert sums.tracks(0)[1] == 0
     assert sums.first(0, np.ones((0, 16)), np.ones((0, 2, 12)), sums.tracks(0)).around.size == 0
     assert sums.tracks(1) == (pytest.approx([0, 1, 2, -1, -2, -3]), 3)
+    assert not sums.repeats_follow
+    assert scores_of_many(None, None, sums) is None
+    assert JointSums(small_arrays()).repeats_follow
 
 
 def test_points_whose_weight_is_zero_add_nothing_whatever_they_are():
