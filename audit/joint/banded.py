@@ -1,13 +1,14 @@
 """S^+ where images see points of their neighbours only: block Cholesky and the selected inverse (method.md section 11).
 
 A video, a street or a strip of aerial photos has columns that couple within a band of width m, so that S is block
-tridiagonal in some order. Its factor costs D m^2 instead of D^3, and D m numbers instead of D^2.
+tridiagonal in some order. Its factor costs D m^2 instead of D^3, and D m numbers instead of D^2. What couples with
+everything, as the parameters of a camera that all images share, is eliminated last: a border of the band.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -22,6 +23,8 @@ from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
 _MIN_BLOCKS: Final = 4  # fewer are no band
+_FAR_REACHING: Final = (8, 4, 2)  # times as many couplings as a column commonly has: it belongs to the border
+_MAX_BORDER: Final = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,27 +32,50 @@ class Band:
     """How the columns of a sparse symmetric matrix are ordered into blocks that couple with the next one only.
 
     order: (D,) column at each place.    place: (D,) of each column.    width: of a block; the last one may be smaller.
+    num_banded: places of the band; the border behind them couples with everything.
     """
 
     order: IntArray
     place: IntArray
     width: int
+    num_banded: int
 
     def blocks(self) -> Iterator[slice]:
         """Places of each block."""
-        for start in range(0, len(self.order), self.width):
-            yield slice(start, min(start + self.width, len(self.order)))
+        for start in range(0, self.num_banded, self.width):
+            yield slice(start, min(start + self.width, self.num_banded))
+
+    @property
+    def num_border(self) -> int:
+        """Columns of the border."""
+        return len(self.order) - self.num_banded
 
 
 def band_of(matrix: sparse.csr_array) -> Band | None:
-    """Order the columns (reverse Cuthill-McKee); None where there is no band worth it."""
+    """Order the columns (reverse Cuthill-McKee), far reaching ones in a border; None where no band is worth it."""
+    couplings = np.diff(matrix.indptr)
+    common = np.median(couplings) if couplings.size else 0.0
+    borders = {0: np.zeros(0, dtype=np.int64)}
+    for times in _FAR_REACHING:
+        border = np.flatnonzero(couplings > times * common)
+        if border.size <= _MAX_BORDER:
+            borders.setdefault(border.size, border)
+    bands = [_ordered(matrix, border) for border in borders.values()]
+    worth = [band for band in bands if band.num_banded >= _MIN_BLOCKS * band.width]
+    return min(worth, key=lambda band: band.width + band.num_border) if worth else None
+
+
+def _ordered(matrix: sparse.csr_array, border: IntArray) -> Band:
+    """The band that is left when some columns are its border."""
     size = matrix.shape[0]
-    order = reverse_cuthill_mckee(matrix, symmetric_mode=True).astype(np.int64)
+    inner = np.delete(np.arange(size), border)
+    within = matrix[inner][:, inner] if border.size else matrix
+    order = np.append(inner[reverse_cuthill_mckee(within, symmetric_mode=True)], border).astype(np.int64)
     place = np.empty(size, dtype=np.int64)
     place[order] = np.arange(size)
-    row = np.repeat(place.astype(np.int32), np.diff(matrix.indptr))
-    width = int(np.abs(row - place.astype(np.int32)[matrix.indices]).max(initial=0))
-    return Band(order, place, max(width, 1)) if size >= _MIN_BLOCKS * max(width, 1) else None
+    by_row = place[inner].astype(np.int32)
+    width = int(np.abs(np.repeat(by_row, np.diff(within.indptr)) - by_row[within.indices]).max(initial=0))
+    return Band(order, place, max(width, 1), inner.size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +84,16 @@ class BandedFactor:
 
     diagonal: L_i of each block.    below: C_i = A_(i+1, i) L_i^-T.    null: (D, g) orthonormal G, all null directions.
     S X S = S, and S^+ = P X P with P = 1 - G G^T. No shift: where there is no such factor, None is built.
+    beside: (D, m) V = [Y E; -1], with Y the inverse of the band alone, zero in the border, and E what couples them.
+    corner: (m, m) K, the border's own block of X, so that X = Y + V K V^T.
     """
 
     band: Band
     diagonal: list[FloatArray]
     below: list[FloatArray]
     null: FloatArray
+    beside: FloatArray
+    corner: FloatArray
     shift: float = 0.0
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -74,8 +104,16 @@ class BandedFactor:
         return out[self.band.place]
 
     def solve_in_order(self, right: FloatArray) -> FloatArray:
-        """X right, (D, c), rows by place; nothing is computed above the first row that is not zero."""
+        """X right, (D, c), rows by place."""
+        out = self.solve_band(right)
+        if self.corner.size:
+            out += self.beside @ (self.corner @ (self.beside.T @ right))
+        return out
+
+    def solve_band(self, right: FloatArray) -> FloatArray:
+        """Y right, (D, c), rows by place; nothing is computed above the first row that is not zero."""
         out = np.array(right, order="C")
+        out[self.band.num_banded :] = 0.0
         blocks = list(self.band.blocks())
         first = int(np.argmax(out.any(axis=1))) // self.band.width
         for i in range(first, len(blocks)):
@@ -124,22 +162,41 @@ def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> Ban
         if i + 1 < len(blocks):
             coupled = ordered[blocks[i + 1], own].toarray()
             below.append(np.ascontiguousarray(_triangular(lower, coupled.T, transposed=False).T))
-    return BandedFactor(band, diagonal, below, free)
+    nothing = np.zeros((len(free), 0))
+    factor = BandedFactor(band, diagonal, below, free, nothing, nothing[:0])
+    return _with_border(factor, ordered, pinned) if band.num_border else factor
+
+
+def _with_border(factor: BandedFactor, ordered: sparse.csr_array, pinned: IntArray) -> BandedFactor | None:
+    """The factor of a band with its border, eliminated last."""
+    start, count = factor.band.num_banded, factor.band.num_border
+    columns = ordered[:, start:].toarray()
+    beside = factor.solve_band(columns)
+    schur = columns[start:] - columns[:start].T @ beside[:start]
+    here = pinned[pinned >= start] - start
+    schur[here, here] += 1.0
+    lower, info = lapack.dpotrf(0.5 * (schur + schur.T), lower=1, clean=1)
+    if info:
+        return None
+    beside[start:] = -np.eye(count)
+    root = _triangular(lower, np.eye(count), transposed=False)
+    return replace(factor, beside=beside, corner=root.T @ root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandedInverse:
-    """S^+ = D^-1 P X P D^-1, of which the blocks near the diagonal are at hand.
+    """S^+ = D^-1 P X P D^-1 = D^-1 (Y - A B^T - B A^T) D^-1, of which the blocks near the diagonal are at hand.
 
-    near: per block i, the entries of X at its rows and at the columns of the blocks i .. i + 3; views of ``flat``,
-    where one follows the other.
-    pull: (D, g) H = X G - G (G^T X G) / 2, so that P X P = X - G H^T - H G^T; by place.
+    near: per block i, the entries of Y at its rows and at the columns of the blocks i .. i + 3; views of ``flat``,
+    where one follows the other. Zero in the border.
+    aside, pull: (D, g + m) A = [G, V] and B = [H, -V K / 2], H = X G - G (G^T X G) / 2; by place.
     inverse_scale: (D,) 1 / D, zero for dead columns; as in the matrix.
     """
 
     factor: BandedFactor
     flat: FloatArray
     near: list[FloatArray]
+    aside: FloatArray
     pull: FloatArray
     inverse_scale: FloatArray
 
@@ -167,14 +224,15 @@ class BandedInverse:
             return self.times(columns, right)[columns]
         place = self.factor.band.place[columns]
         order = np.argsort(place, kind="stable")
+        order = order[: np.searchsorted(place[order], self.factor.band.num_banded)]
         entries = near_entries(place[order], self.factor.band.width, self.flat, *_places_in_flat(self.near))
         if entries is None:
             return np.asarray(self.block(columns) @ right)
-        scale, null, pull = self.inverse_scale[columns][:, None], self.factor.null[place], self.pull[place]
+        scale, aside, pull = self.inverse_scale[columns][:, None], self.aside[place], self.pull[place]
         scaled = right * scale
-        out = np.empty_like(scaled)
+        out = np.zeros_like(scaled)
         out[order] = entries @ scaled[order]
-        out -= null @ (pull.T @ scaled) + pull @ (null.T @ scaled)
+        out -= aside @ (pull.T @ scaled) + pull @ (aside.T @ scaled)
         return np.asarray(scale * out)
 
     def blocks(self, columns: IntArray) -> FloatArray:
@@ -183,44 +241,48 @@ class BandedInverse:
         lower = np.minimum(place[:, :, None], place[:, None, :])
         higher = np.maximum(place[:, :, None], place[:, None, :])
         starts, sizes = _places_in_flat(self.near)
-        number = lower // width
-        far = (higher - number * width >= sizes[number]).any(axis=(1, 2))
+        in_band = higher < self.factor.band.num_banded
+        number = np.where(in_band, lower // width, 0)
+        too_far = in_band & (higher - number * width >= sizes[number])
         at = starts[number] + (lower - number * width) * sizes[number] + higher - number * width
-        out = self.flat.take(np.where(far[:, None, None], 0, at))
-        outer = self.factor.null[place] @ self.pull[place].swapaxes(1, 2)
+        out = np.where(in_band, self.flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
+        outer = self.aside[place] @ self.pull[place].swapaxes(1, 2)
         out -= outer + outer.swapaxes(1, 2)
         scale = self.inverse_scale[columns]
         out *= scale[:, None, :] * scale[:, :, None]
-        for k in np.flatnonzero(far).tolist():
+        for k in np.flatnonzero(too_far.any(axis=(1, 2))).tolist():
             out[k] = self.block(columns[k])
         return np.asarray(out)
 
     def arrays(self) -> BandArrays:
         """As compiled sums take it."""
         band, starts = self.factor.band, _places_in_flat(self.near)
-        return BandArrays(band.place, band.width, self.flat, *starts, self.factor.null, self.pull, self.inverse_scale)
+        outer = self.aside, self.pull
+        return BandArrays(band.place, band.num_banded, band.width, self.flat, *starts, *outer, self.inverse_scale)
 
     def _is_near(self, columns: IntArray) -> bool:
         """Whether all entries at some columns are at hand."""
-        number = self.factor.band.place[columns] // self.factor.band.width
+        place = self.factor.band.place[columns]
+        number = place[place < self.factor.band.num_banded] // self.factor.band.width
         return not number.size or int(number.max() - number.min()) <= _REACH
 
     def block(self, columns: IntArray) -> FloatArray:
         """(k, k) entries of S^+ at some columns."""
         if not self._is_near(columns):
             return self.rows(columns)[:, columns]
-        place = self.factor.band.place[columns]
+        place, band = self.factor.band.place[columns], self.factor.band
         by_place = np.argsort(place, kind="stable")
         place = place[by_place]
-        number = place // self.factor.band.width
-        out = np.empty((place.size, place.size))
-        bounds = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [place.size]]).tolist()
-        for start, stop in pairwise(bounds) if place.size else ():
-            origin = number[start] * self.factor.band.width
-            part = self.near[number[start]][np.ix_(place[start:stop] - origin, place[start:] - origin)]
-            out[start:stop, start:] = part
-            out[stop:, start:stop] = part[:, stop - start :].T
-        outer = self.factor.null[place] @ self.pull[place].T
+        inner = int(np.searchsorted(place, band.num_banded))
+        number = place[:inner] // band.width
+        out = np.zeros((place.size, place.size))
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [inner]]).tolist()
+        for start, stop in pairwise(bounds) if inner else ():
+            origin = number[start] * band.width
+            part = self.near[number[start]][np.ix_(place[start:stop] - origin, place[start:inner] - origin)]
+            out[start:stop, start:inner] = part
+            out[stop:inner, start:stop] = part[:, stop - start :].T
+        outer = self.aside[place] @ self.pull[place].T
         out -= outer + outer.T
         back = np.argsort(by_place, kind="stable")
         scale = self.inverse_scale[columns]
@@ -241,7 +303,7 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     From the last block to the first, with U_i = C_i L_i^-1: X_(i, j) = -U_i^T X_(i+1, j) for j > i, and
     X_(i, i) = (L_i L_i^T)^-1 - X_(i, i+1) U_i.
     """
-    width, size = factor.band.width, len(factor.band.order)
+    width, size = factor.band.width, factor.band.num_banded
     shapes = [(own.stop - own.start, min((_REACH + 1) * width, size - own.start)) for own in factor.band.blocks()]
     ends = np.cumsum([rows * columns for rows, columns in shapes])
     flat = np.empty(int(ends[-1]))
@@ -258,4 +320,5 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
         near[i][:, : len(own)], near[i][:, len(own) :] = 0.5 * (own + own.T), beside
     null = factor.null
     pulled = factor.solve_in_order(null)
-    return BandedInverse(factor, flat, near, pulled - 0.5 * null @ (null.T @ pulled), inverse_scale)
+    pull = np.hstack([pulled - 0.5 * null @ (null.T @ pulled), -0.5 * factor.beside @ factor.corner])
+    return BandedInverse(factor, flat, near, np.hstack([null, factor.beside]), pull, inverse_scale)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import blas, lapack
 
-from sfm_audit.audit.joint.banded import BandedInverse
+from sfm_audit.audit.joint.banded import BandedFactor, BandedInverse
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
@@ -24,25 +24,40 @@ def banded_sandwiches(
     N_i = M_(i+1, i) - U_i M_(i, i),  M_(i+1, i+1) -= U_i M_(i, i+1) + N_i U_i^T. Then back, Y = X M X, D_i = T_i^-1:
     Y_(i, i+1) = D_i N_i^T X_(i+1, i+1) - U_i^T Y_(i+1, i+1),
     Y_(i, i) = D_i M_(i, i) D_i - Y_(i, i+1) U_i - U_i^T X_(i+1, i+1) N_i D_i.
+    All this is of the band; with X + V K V^T in the place of X and Q = (X + V K V^T) M V, the border adds B V^T + V B^T,
+    B = Q K - V K V^T M V K / 2.
     """
-    band, null, scale = main.factor.band, main.factor.null, main.inverse_scale
+    factor, band, null, scale = main.factor, main.factor.band, main.factor.null, main.inverse_scale
     scaled = sparse.csr_array(sparse.diags_array(scale) @ meat @ sparse.diags_array(scale))
     ordered = sparse.csr_array(scaled[band.order][:, band.order])
     near = _near(main, ordered)
-    pulled = main.factor.solve_in_order(ordered @ main.factor.solve_in_order(null))
+    pulled = factor.solve_in_order(ordered @ factor.solve_in_order(null))
     pull = pulled - 0.5 * null @ (null.T @ pulled)  # P Y P = Y - G H^T - H G^T
+    aside, pull = main.aside, np.hstack([pull, -_of_border(factor, ordered)])
     out: list[FloatArray | None] = []
     for block in blocks:
         place = band.place[block]
-        number = place // band.width
+        inner = place < band.num_banded
+        number = place[inner] // band.width
         first = int(number.min()) if number.size else 0
         if number.size and number.max() - first > 1:
             out.append(None)
             continue
-        outer = null[place] @ pull[place].T
-        values = _entries(near, place, first * band.width, first) - outer - outer.T
+        outer = aside[place] @ pull[place].T
+        values = -outer - outer.T
+        values[np.ix_(inner, inner)] += _entries(near, place[inner], first * band.width, first)
         out.append(values * scale[block] * scale[block][:, None])
     return out
+
+
+def _of_border(factor: BandedFactor, meat: sparse.csr_array) -> FloatArray:
+    """B (D, m) by place: what the border adds to the sandwich of the band alone is B V^T + V B^T."""
+    beside, corner = factor.beside, factor.corner
+    if not corner.size:
+        return beside
+    weighed = meat @ beside
+    inner = corner @ (beside.T @ weighed) @ corner
+    return np.asarray(factor.solve_in_order(weighed) @ corner - 0.5 * beside @ inner)
 
 
 def _entries(near: list[FloatArray], place: IntArray, origin: int, first: int) -> FloatArray:

@@ -19,18 +19,20 @@ _FACTS: Final = 27
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandArrays:
-    """X of a banded S^+ by places; see `sfm_audit.audit.joint.banded.BandedInverse`.
+    """A banded S^+ by places; see `sfm_audit.audit.joint.banded.BandedInverse`.
 
-    place: (D,) of each column.    width: of a block.    near: (m,), one block behind the other; starts: (b + 1,);
-    columns: (b,) of each block.    null, pull: (D, g) G and H, by place.    scale: (D,) 1 / D, by column.
+    place: (D,) of each column, those of the border from num_banded on.    width: of a block.    near: (m,), one block
+    behind the other; starts: (b + 1,); columns: (b,) of each block.    aside, pull: (D, g) A and B, by place.
+    scale: (D,) 1 / D, by column.
     """
 
     place: IntArray
+    num_banded: int
     width: int
     near: FloatArray
     starts: IntArray
     columns: IntArray
-    null: FloatArray
+    aside: FloatArray
     pull: FloatArray
     scale: FloatArray
 
@@ -98,8 +100,8 @@ class _Inverse(ctypes.Structure):
     _fields_ = (
         *(("size", ctypes.c_int64), ("width", ctypes.c_int64)),
         *((name, ctypes.c_void_p) for name in ("columns", "transform", "dense")),
-        *((name, ctypes.c_int64) for name in ("band_width", "num_blocks", "num_null")),
-        *((name, ctypes.c_void_p) for name in ("place", "starts", "block_columns", "near", "null", "pull", "scale")),
+        *((name, ctypes.c_int64) for name in ("num_banded", "band_width", "num_blocks", "num_outer")),
+        *((name, ctypes.c_void_p) for name in ("place", "starts", "block_columns", "near", "aside", "pull", "scale")),
         *((name, ctypes.c_int64) for name in ("num_update", "num_extra")),
         *((name, ctypes.c_void_p) for name in ("update", "border", "corner", "extra_column")),
     )
@@ -157,10 +159,11 @@ class JointScores:
             ints(band.starts, num_blocks + 1),
             ints(band.columns, num_blocks),
         )
-        rows = np.diff(np.append(np.arange(num_blocks) * band.width, size))
+        rows = np.diff(np.append(np.arange(num_blocks) * band.width, band.num_banded))
         is_sound = (
             band.width >= 1
-            and num_blocks == -(-size // band.width)
+            and 0 <= band.num_banded <= size
+            and num_blocks == -(-band.num_banded // band.width)
             and (not size or (place.min() >= 0 and place.max() < size))
             and starts[0] == 0
             and starts[-1] == band.near.size
@@ -168,15 +171,16 @@ class JointScores:
         )
         if not is_sound:
             raise ValueError("blocks of another band")
-        num_null = band.null.shape[1]
-        self._inverse.band_width, self._inverse.num_blocks, self._inverse.num_null = band.width, num_blocks, num_null
+        num_outer = band.aside.shape[1]
+        self._inverse.num_banded, self._inverse.band_width = band.num_banded, band.width
+        self._inverse.num_blocks, self._inverse.num_outer = num_blocks, num_outer
         given = {
             "place": place,
             "starts": starts,
             "block_columns": columns,
             "near": doubles(band.near, band.near.shape),
         }
-        given |= {name: doubles(getattr(band, name), (size, num_null)) for name in ("null", "pull")}
+        given |= {name: doubles(getattr(band, name), (size, num_outer)) for name in ("aside", "pull")}
         for name, array in {**given, "scale": doubles(band.scale, (size,))}.items():
             setattr(self._inverse, name, self._kept(array))
 

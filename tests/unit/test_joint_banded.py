@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, system_of
 from numpy.testing import assert_allclose
+from scipy import sparse
 
 from sfm_audit.audit.joint import inverse as joint_inverses
-from sfm_audit.audit.joint.banded import BandedInverse, band_of
+from sfm_audit.audit.joint.banded import BandedInverse, band_of, banded_factor
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
@@ -20,10 +21,13 @@ from sfm_audit.audit.joint.own import _walds, walds
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
 
 
-@pytest.fixture(scope="module")
-def street():
-    """A model whose images see what their neighbours see, and nothing else."""
-    return system_of(model_of(STREET, seed=4))
+SHARED = dataclasses.replace(STREET, shared_camera=True)
+
+
+@pytest.fixture(scope="module", params=[STREET, SHARED], ids=["own cameras", "one camera"])
+def street(request):
+    """A model whose images see what their neighbours see, and nothing else; or share a camera besides."""
+    return system_of(model_of(request.param, seed=4))
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +54,20 @@ def dense(street, monkeypatch):
     return inverted(street)
 
 
+def own_of(system, image):
+    """Columns of the camera of an image."""
+    return system.observations.layout.own_of_image(image)
+
+
 def test_a_street_is_a_band_and_a_room_is_none(street, reduced):
     band = band_of(reduced.matrix)
-    row, column = reduced.matrix.nonzero()
-    assert band is not None
-    assert np.abs(band.place[row] - band.place[column]).max() == band.width
+    row, column = (band.place[each] for each in reduced.matrix.nonzero())
+    within = (row < band.num_banded) & (column < band.num_banded)
+    assert np.abs(row[within] - column[within]).max() == band.width
     assert (band.order[band.place] == np.arange(len(band.order))).all()
+    is_shared = len(street.model.cameras) == 1
+    assert np.sort(band.order[band.num_banded :]).tolist() == (own_of(street, 0).tolist() if is_shared else [])
+    assert band.num_border == (2 if is_shared else 0)
     room = system_of(model_of(dataclasses.replace(SPEC, num_images=12), seed=1))
     assert band_of(reduced_systems(room.observations)[0].matrix) is None
     assert isinstance(street.base.inverse.main, BandedInverse)
@@ -69,7 +81,7 @@ def test_it_is_the_pseudo_inverse(street, reduced, scale):
     main, size = street.base.inverse.main, len(scale)
     tolerance = {"atol": 1e-8 * np.abs(expected).max()}
     rng = np.random.default_rng(0)
-    near = street.observations.layout.columns[20:24].ravel()
+    near = np.unique(street.observations.layout.columns[20:24])
     for columns in (np.arange(size), near, rng.permutation(near), np.array([0, size - 1, 7]), near[:0]):
         both = scale[columns] * scale[columns][:, None]
         assert_allclose(main.block(columns) * both, expected[np.ix_(columns, columns)], **tolerance)
@@ -93,7 +105,7 @@ def test_it_is_the_dense_inverse(street, scale, dense):
 
 
 def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
-    dead = int(street.observations.layout.own_of_camera(30)[1])
+    dead = int(own_of(street, 30)[1])
     found = inverted(street, dead=[dead])
     monkeypatch.setattr(joint_inverses, "band_of", lambda _: None)
     expected = inverted(street, dead=[dead])
@@ -106,7 +118,7 @@ def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
 
 def test_a_further_null_direction_is_found_in_a_band_too(street, reduced):
     """A parameter made a copy of another one of its camera: S of x_a + x_b alone."""
-    first, second = street.observations.layout.own_of_camera(30)
+    first, second = own_of(street, 30)
     merge = np.eye(len(reduced.right))
     merge[second] = merge[first]
     matrix = type(reduced.matrix)(merge @ reduced.matrix.toarray() @ merge.T)
@@ -121,7 +133,7 @@ def test_covariances_are_the_sandwich_by_numpy(street, reduced, scale):
     meat = score_meat(street.observations, street.base.left_px).toarray() / scale / scale[:, None]
     unit = np.linalg.pinv(reduced.matrix.toarray() / scale / scale[:, None], rcond=1e-11, hermitian=True)
     expected, layout = unit @ meat @ unit, street.observations.layout
-    blocks = [*layout.columns, *(layout.own_of_camera(k) for k in range(60))]
+    blocks = [*layout.columns, *(layout.own_of_camera(k) for k in range(len(street.model.cameras)))]
     found = banded_sandwiches(street.base.inverse.main, score_meat(street.observations, street.base.left_px), blocks)
     for block, own, public in zip(blocks, found, street.covariances(blocks), strict=True):
         both = scale[block] * scale[block][:, None]
@@ -130,15 +142,16 @@ def test_covariances_are_the_sandwich_by_numpy(street, reduced, scale):
 
 
 def test_blocks_of_columns_that_lie_apart_have_the_same_covariance(street):
-    apart = np.concatenate([street.observations.layout.columns[3], street.observations.layout.columns[50]])
-    (both,), (first,) = street.covariances([apart]), street.covariances([apart[:8]])
-    assert_allclose(both[:8, :8], first, rtol=1e-6)
+    apart = np.unique(street.observations.layout.columns[[3, 50]])
+    own = np.searchsorted(apart, street.observations.layout.columns[3])
+    (both,), (first,) = street.covariances([apart]), street.covariances([street.observations.layout.columns[3]])
+    assert_allclose(both[np.ix_(own, own)], first, rtol=1e-6)
 
 
 def test_blocks_of_many_images_are_those_of_one(street, dense):
     columns = street.observations.layout.columns[:, :8]
-    order = street.base.inverse.main.factor.band.order
-    far = np.concatenate([order[:4], order[-4:]])[None]
+    band = street.base.inverse.main.factor.band
+    far = np.concatenate([band.order[:4], band.order[band.num_banded - 4 : band.num_banded]])[None]
     assert not street.base.inverse.main._is_near(far[0])
     asked = np.concatenate([columns, far])
     for main in (street.base.inverse.main, dense.main):
@@ -171,3 +184,23 @@ def test_a_direction_that_nothing_holds_gains_nothing():
     blocks = np.array([[[1.0, 1.0], [1.0, 1.0]]])
     found = _walds(np.repeat(blocks, 2, axis=0), np.ones((2, 2), dtype=bool), np.array([[1.0, 1.0], [1.0, -1.0]]))
     assert_allclose(found, [1.0, 0.0], atol=1e-9)
+
+
+def test_cameras_of_a_street_each_for_a_part_of_it_are_its_border():
+    """Three cameras, one after the other along the way: the band of the poses alone is the narrowest."""
+    model = model_of(STREET, seed=4)
+    thirds = np.arange(60) * 3 // 60
+    images = dataclasses.replace(model.images, camera_idx=thirds)
+    matrix = reduced_systems(system_of(dataclasses.replace(model, images=images)).observations)[0].matrix
+    band = band_of(matrix)
+    layout = system_of(dataclasses.replace(model, images=images)).observations.layout
+    assert set(band.order[band.num_banded :]) >= {int(c) for k in (0, 20, 59) for c in layout.own_of_image(k)}
+
+
+def test_a_border_that_is_not_positive_definite_makes_no_factor(street, reduced):
+    """Below the rest of the diagonal by more than the elimination leaves: the dense way finds out what it is."""
+    band = band_of(reduced.matrix)
+    matrix = reduced.matrix.toarray()
+    matrix[own_of(street, 0), own_of(street, 0)] *= 1e-3
+    gauge = np.zeros((len(matrix), 0))
+    assert banded_factor(sparse.csr_array(matrix), band, gauge) is None

@@ -33,12 +33,12 @@ from sfm_audit.audit.table.words import MisfitGroup
 
 pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here: nothing to compare")
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
-KINDS = ("SIMPLE_RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE", "FULL_OPENCV", "shared", "rig", "twice", "street")
+KINDS = ("SIMPLE_RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE", "FULL_OPENCV", "shared", "rig", "twice", "street", "shared street")
 
 
 def model_named(name):
-    if name == "street":
-        return model_of(STREET, seed=2)
+    if name.endswith("street"):
+        return model_of(dataclasses.replace(STREET, shared_camera=name.startswith("shared")), seed=2)
     if name == "rig":
         return with_rig(model_of(dataclasses.replace(SPEC, num_images=8), seed=3))
     spec = dataclasses.replace(SPEC, shared_camera=True) if name in {"shared", "twice"} else SPEC
@@ -103,7 +103,7 @@ def test_many_images_have_the_scores_of_one(asked, beside):
     base, sums, many = beside
     powers = [asked.beside.power(image) for image in asked.images]
     layout = asked.system.observations.layout
-    assert isinstance(base.inverse.main, BandedInverse) == (asked.name == "street")
+    assert isinstance(base.inverse.main, BandedInverse) == asked.name.endswith("street")
     for image, power, found in zip(asked.images, powers, many.scores(asked.images, powers), strict=True):
         expected = image_scores(asked.system, base, sums, image, power)
         assert (found is None) == (expected is None) == (asked.name == "FULL_OPENCV")
@@ -163,11 +163,11 @@ def test_fields_whose_functions_all_but_cancel_are_left_to_numpy(asked, least, m
 
 
 def test_a_band_that_does_not_reach_is_left_to_numpy(asked):
-    if asked.name != "street":
+    if not asked.name.endswith("street"):
         return
     main, observations = asked.system.base.inverse.main, asked.system.observations
     arrays = main.arrays()
-    width, size = arrays.width, len(arrays.place)
+    width, size = arrays.width, arrays.num_banded
     rows = np.minimum(width, size - width * np.arange(len(arrays.columns)))
     near = np.concatenate([block[:, :own].ravel() for block, own in zip(main.near, rows.tolist(), strict=True)])
     short = dataclasses.replace(arrays, near=near, columns=rows, starts=np.cumsum([0, *rows**2]))
@@ -176,7 +176,7 @@ def test_a_band_that_does_not_reach_is_left_to_numpy(asked):
     found = asked.many.scores(asked.images, [0] * len(asked.images))
     asked.many._kernel = JointScores(*given, arrays, **behind)
     assert any(each is None for each in found)
-    for changes in ({"width": width + 1}, {"place": arrays.place + 1}, {"near": near}, {"starts": arrays.starts + 1}):
+    for changes in ({"width": width + 1}, {"place": arrays.place + 1}, {"near": near}, {"num_banded": len(arrays.place) + 1}, {"starts": arrays.starts + 1}):
         with pytest.raises(ValueError, match="another band"):
             JointScores(*given, dataclasses.replace(arrays, **changes), **behind)
 

@@ -4,16 +4,16 @@
 
 enum { TILE = 16, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64 };
 
-/* S^+ (size, size) of the base: dense, or X of a band by places, D^-1 (X - G H^T - H G^T) D^-1 (audit/joint/banded.py). */
+/* S^+ (size, size) of the base: dense, or of a band by places, D^-1 (Y - A B^T - B A^T) D^-1 (audit/joint/banded.py). */
 typedef struct {
     int64_t size, width;       /* width of an image's columns */
     const int64_t *columns;    /* (I, width); `size` where an image has none */
     const double *transform;   /* (I, width, width) */
     const double *dense;       /* NULL: banded */
-    int64_t band_width, num_blocks, num_null;
+    int64_t num_banded, band_width, num_blocks, num_outer; /* places from num_banded on are the border: Y is zero there */
     const int64_t *place;      /* (size) of each column */
     const int64_t *starts, *block_columns;
-    const double *near, *null, *pull, *scale;
+    const double *near, *aside, *pull, *scale;
     /* what was included since: S^+ + U U^T, its border (size, num_extra) and corner (num_extra, num_extra) */
     int64_t num_update, num_extra;
     const double *update, *border, *corner;
@@ -57,7 +57,7 @@ INLINE void add_product(int64_t rows, int64_t columns, const double *entries, co
     }
 }
 
-/* Entries of X at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. */
+/* Entries of Y at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. */
 INLINE int entries_of(
     const base_inverse *s, const keyed *key, int64_t first_row, int64_t rows, int64_t first_column, int64_t columns, double *out) {
     for (int64_t i = 0; i < rows; i++) {
@@ -86,12 +86,14 @@ static inline __attribute__((always_inline)) int times_inverse(
         double d = s->dense ? 1.0 : s->scale[column[i]];
         for (int c = 0; c < FIELDS; c++) scaled[FIELDS * i + c] = d * from[FIELDS * i + c];
     }
+    int64_t inner = num;
+    while (!s->dense && inner && key[inner - 1].key >= s->num_banded) inner--;
     memset(out, 0, (size_t)(num * FIELDS) * sizeof *out);
-    for (int64_t i = 0; i < num; i += TILE) {
-        int64_t rows = num - i < TILE ? num - i : TILE;
-        for (int64_t j = i; j < num; j += TILE) {
+    for (int64_t i = 0; i < inner; i += TILE) {
+        int64_t rows = inner - i < TILE ? inner - i : TILE;
+        for (int64_t j = i; j < inner; j += TILE) {
             double tile[TILE * TILE], turned[TILE * TILE];
-            int64_t columns = num - j < TILE ? num - j : TILE;
+            int64_t columns = inner - j < TILE ? inner - j : TILE;
             if (!entries_of(s, key, i, rows, j, columns, tile)) return 0;
             if (i == j) {
                 for (int64_t a = 0; a < rows; a++) {
@@ -106,15 +108,15 @@ static inline __attribute__((always_inline)) int times_inverse(
             add_product(rows, columns, tile, scaled + FIELDS * j, out + FIELDS * i);
         }
     }
-    for (int64_t k = 0; !s->dense && k < s->num_null; k++) {
-        double of_null[FIELDS] = {0.0}, of_pull[FIELDS] = {0.0};
+    for (int64_t k = 0; !s->dense && k < s->num_outer; k++) {
+        double of_aside[FIELDS] = {0.0}, of_pull[FIELDS] = {0.0};
         for (int64_t i = 0; i < num; i++) {
-            add_row(of_null, s->null[key[i].key * s->num_null + k], scaled + FIELDS * i);
-            add_row(of_pull, s->pull[key[i].key * s->num_null + k], scaled + FIELDS * i);
+            add_row(of_aside, s->aside[key[i].key * s->num_outer + k], scaled + FIELDS * i);
+            add_row(of_pull, s->pull[key[i].key * s->num_outer + k], scaled + FIELDS * i);
         }
         for (int64_t i = 0; i < num; i++) {
-            add_row(out + FIELDS * i, -s->null[key[i].key * s->num_null + k], of_pull);
-            add_row(out + FIELDS * i, -s->pull[key[i].key * s->num_null + k], of_null);
+            add_row(out + FIELDS * i, -s->aside[key[i].key * s->num_outer + k], of_pull);
+            add_row(out + FIELDS * i, -s->pull[key[i].key * s->num_outer + k], of_aside);
         }
     }
     for (int64_t i = 0; !s->dense && i < num; i++) {
