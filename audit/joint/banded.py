@@ -145,7 +145,9 @@ def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> Ban
     """
     ordered = matrix[band.order][:, band.order]
     free = null[band.order]
-    pinned = np.sort(qr(free.T, mode="r", pivoting=True)[1][: free.shape[1]]) if free.shape[1] else np.empty(0, int)
+    pinned = np.empty(0, dtype=np.int64)
+    if free.shape[1]:
+        pinned = np.sort(qr(free.T, mode="r", pivoting=True)[1][: free.shape[1]]).astype(np.int64)
     diagonal: list[FloatArray] = []
     below: list[FloatArray] = []
     blocks = list(band.blocks())

@@ -24,8 +24,8 @@ def banded_sandwiches(
     N_i = M_(i+1, i) - U_i M_(i, i),  M_(i+1, i+1) -= U_i M_(i, i+1) + N_i U_i^T. Then back, Y = X M X, D_i = T_i^-1:
     Y_(i, i+1) = D_i N_i^T X_(i+1, i+1) - U_i^T Y_(i+1, i+1),
     Y_(i, i) = D_i M_(i, i) D_i - Y_(i, i+1) U_i - U_i^T X_(i+1, i+1) N_i D_i.
-    All this is of the band; with X + V K V^T in the place of X and Q = (X + V K V^T) M V, the border adds B V^T + V B^T,
-    B = Q K - V K V^T M V K / 2.
+    All this is of the band; with X + V K V^T in the place of X and Q = (X + V K V^T) M V, the border adds
+    B V^T + V B^T, B = Q K - V K V^T M V K / 2.
     """
     factor, band, null, scale = main.factor, main.factor.band, main.factor.null, main.inverse_scale
     scaled = sparse.csr_array(sparse.diags_array(scale) @ meat @ sparse.diags_array(scale))
