@@ -68,8 +68,10 @@ def audit(folder: str) -> None:
     """Audit stage by stage; the joint step late, so that memory without it can be told."""
     clock = _Laps()
     from sfm_audit.audit.engine.model import ModelAuditor  # noqa: PLC0415
+    from sfm_audit.audit.schedule.memory import keep_freed  # noqa: PLC0415
     from sfm_audit.loaders import open_model  # noqa: PLC0415
 
+    keep_freed()  # as the command line does
     clock.lap("imports")
     auditor = ModelAuditor(open_model(folder))
     clock.lap("read, check")

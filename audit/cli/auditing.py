@@ -22,6 +22,7 @@ from sfm_audit.audit.cli.terminal import print_page, terminal_page
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.kernels import KernelError, kernels_in_use, path_taken
 from sfm_audit.audit.schedule.errors import ClusterError
+from sfm_audit.audit.schedule.memory import give_back
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_PROCESS
 from sfm_audit.audit.schedule.runner import audit_many
 from sfm_audit.audit.schedule.task import NO_LIMITS, Failure, Limits
@@ -140,6 +141,7 @@ def _write_run(request: RunRequest, found: Discovery, problems: list[RunFailure]
         def on_done(ref: ModelRef) -> None:
             progress.advance(ref)
             note(f"audited {ref.model_path} after {time.perf_counter() - start:.1f} s")
+            give_back()
 
         def on_skip(ref: ModelRef) -> None:
             progress.skip(ref)

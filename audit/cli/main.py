@@ -16,6 +16,7 @@ from sfm_audit.audit.cli.errors import LOGGER, Ended, ExitCode, KnownError, comp
 from sfm_audit.audit.cli.journal import journal, note, with_journal
 from sfm_audit.audit.cli.suggestions import did_you_mean
 from sfm_audit.audit.schedule.garbage import importing, leaving
+from sfm_audit.audit.schedule.memory import keep_freed
 
 VERBS: Final = {
     "run": "Audit reconstructions and write the tables into a run folder.",
@@ -144,6 +145,7 @@ def entry_point() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores SIGHUP, and so do we
             signal.signal(number, partial(_end, code))
+    keep_freed()
     try:
         exit_code = main(sys.argv[1:])
     except Exception:  # noqa: BLE001 - a bug; Python's own exit code for it, 1, would say that a gate failed

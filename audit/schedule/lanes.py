@@ -23,6 +23,7 @@ from typing import Any, Final, Generic, Literal, Self, TypeVar
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.schedule.garbage import importing, leaving
+from sfm_audit.audit.schedule.memory import give_back, keep_freed
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
 _BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -232,6 +233,7 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ.update(dict.fromkeys(_BLAS_VARIABLES, "1"))  # for libraries that the first call loads
+    keep_freed()
     while True:
         try:
             with importing():  # the first call's function is imported when it arrives
@@ -249,6 +251,8 @@ def _serve(connection: Connection) -> None:
             connection.send(answer)
         except (BrokenPipeError, ConnectionError):
             return
+        del function, arguments, answer
+        give_back()
 
 
 def _end_with_parent() -> None:
