@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm_audit.loaders.arrays import FloatArray, UInt64Array
 from sfm_audit.loaders.assembly.consistency import find_inconsistencies
 from sfm_audit.loaders.assembly.extremes import unused_nonfinite
 from sfm_audit.loaders.assembly.lookup import rows_of
-from sfm_audit.loaders.assembly.raw import RawModel
+from sfm_audit.loaders.assembly.raw import RawModel, RawPoints
 from sfm_audit.loaders.assembly.rigs import compose_poses
 from sfm_audit.loaders.model import ImageTable, ObservationTable, PointTable, SparseModel
 
@@ -21,12 +22,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
     location : where they lie, as the user gave it
     file_format : name of the format they were read from
     """
-    order = raw.points.order
-    points = PointTable(
-        point3d_id=raw.points.point3d_id[order],
-        xyz_world=raw.points.xyz_world[order],
-        stored_error_px=raw.points.stored_error_px[order],
-    )
+    points = PointTable(*_sorted(raw.points))
     placed, rig_findings = compose_poses(raw)
     images = ImageTable(
         image_id=raw.images.image_id,
@@ -56,3 +52,11 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         observations,
         known + find_inconsistencies(model, raw),
     )
+
+
+def _sorted(points: RawPoints) -> tuple[UInt64Array, FloatArray, FloatArray]:
+    """Return ids, xyz and stored errors in the order of the ids; as they are where that is the order of the file."""
+    ids, order = points.point3d_id, points.order
+    if (ids[1:] > ids[:-1]).all():
+        return ids, points.xyz_world, points.stored_error_px
+    return ids[order], points.xyz_world[order], points.stored_error_px[order]

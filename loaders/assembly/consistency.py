@@ -126,9 +126,8 @@ def _non_unit_quaternions(model: SparseModel) -> Finding | None:
 
 
 def _non_finite_observations(model: SparseModel) -> Finding | None:
-    with np.errstate(invalid="ignore", over="ignore"):
-        if np.isfinite(np.sum(model.observations.xy_px)):  # one number tells the usual case
-            return None
+    if _sums_up(model.observations.xy_px):
+        return None
     is_wrong = ~all_finite(model.observations.xy_px)
     text = "{count} of {total} linked 2D points are not finite, e.g. in image {example}"
     return _of_observations(FindingCode.NON_FINITE_OBSERVATIONS, text, is_wrong, model)
@@ -155,7 +154,15 @@ def _observations_outside(model: SparseModel) -> Finding | None:
     return Finding(FindingCode.OBSERVATIONS_OUTSIDE, count, text)
 
 
+def _sums_up(values: FloatArray) -> bool:
+    """Whether one number tells that all are finite: the usual case."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool(np.isfinite(np.sum(values)))
+
+
 def _non_finite_points(model: SparseModel) -> Finding | None:
+    if _sums_up(model.points.xyz_world):
+        return None
     is_wrong = ~all_finite(model.points.xyz_world)
     text = "{count} of {total} 3D points are not finite, e.g. point {example}"
     return _of_rows(FindingCode.NON_FINITE_POINTS, text, is_wrong, model.points.point3d_id)

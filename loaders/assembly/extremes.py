@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.assembly.raw import RawModel
-from sfm_audit.loaders.camera_models import BY_ID
+from sfm_audit.loaders.camera_models import BY_ID, CameraModel
 from sfm_audit.loaders.model import CameraTable, Finding, FindingCode, SparseModel
 
 MAX_MAGNITUDE: Final = 1e12
@@ -21,7 +21,10 @@ _MAX_DISTORTION: Final = 1e6
 def implausible_cameras(model: SparseModel) -> Finding | None:
     """Cameras with a side of 0 px, a focal length that no lens has, or a distortion parameter above 1e6."""
     cameras = model.cameras
-    is_wrong = np.array([_is_implausible(cameras, row) for row in range(len(cameras))], dtype=np.bool_)
+    is_wrong = np.zeros(len(cameras), dtype=np.bool_)
+    for model_id in np.unique(cameras.model_id).tolist():
+        rows = np.flatnonzero(cameras.model_id == model_id)
+        is_wrong[rows] = _are_implausible(cameras, rows, BY_ID[model_id])
     if not is_wrong.any():
         return None
     row, count = int(np.argmax(is_wrong)), int(np.count_nonzero(is_wrong))
@@ -32,24 +35,22 @@ def implausible_cameras(model: SparseModel) -> Finding | None:
     return Finding(FindingCode.IMPLAUSIBLE_CAMERAS, count, text)
 
 
-def _is_implausible(cameras: CameraTable, row: int) -> bool:
-    model = BY_ID[int(cameras.model_id[row])]
-    width, height = int(cameras.width[row]), int(cameras.height[row])
-    if min(width, height) == 0:
-        return True
-    params = cameras.params[cameras.param_offsets[row] : cameras.param_offsets[row + 1]]
-    if not np.isfinite(params).all():
-        return False  # a finding of its own
+def _are_implausible(cameras: CameraTable, rows: IntArray, model: CameraModel) -> BoolArray:
+    """Which cameras (n,) in some rows, all of one model, are implausible; not finite is a finding of its own."""
+    width, height = cameras.width[rows], cameras.height[rows]
+    params = cameras.params[cameras.param_offsets[rows, None] + np.arange(model.num_params)]
     least, most = _FOCAL_OVER_SIZE
-    focals = [abs(float(params[i])) / max(width, height) for i in model.focal_idxs]
-    extra = [abs(float(params[i])) for i in model.extra_idxs]
-    pixels = [abs(float(params[i])) for i in range(len(params)) if i not in model.extra_idxs]
-    return (
-        any(not least <= focal <= most for focal in focals)
-        or any(value > _MAX_DISTORTION for value in extra)
-        or any(value > MAX_MAGNITUDE for value in pixels)
-        or (model.is_spherical and min(pixels) == 0.0)
-    )
+    extra = list(model.extra_idxs)
+    others = [i for i in range(model.num_params) if i not in extra]
+    with np.errstate(all="ignore"):
+        sizes = np.abs(params)
+        focal = sizes[:, list(model.focal_idxs)] / np.maximum(width, height)[:, None]
+        is_wrong = ~((focal >= least) & (focal <= most)).all(axis=1)
+        is_wrong |= (sizes[:, extra] > _MAX_DISTORTION).any(axis=1)
+        is_wrong |= (sizes[:, others] > MAX_MAGNITUDE).any(axis=1)
+    if model.is_spherical:
+        is_wrong |= (sizes[:, others] == 0.0).any(axis=1)
+    return np.asarray((np.minimum(width, height) == 0) | (is_wrong & np.isfinite(params).all(axis=1)))
 
 
 def extreme_values(model: SparseModel) -> Finding | None:

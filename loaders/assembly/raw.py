@@ -153,7 +153,7 @@ class LinkedPoints:
     def add(self, fields: UInt64Array) -> _Linked:
         """Take an image's POINTS2D (n, 3), bits of x, y and the point's id; return what is kept of the linked ones."""
         chosen = np.flatnonzero(fields[:, 2] != UNLINKED)
-        linked = fields if len(chosen) == len(fields) else fields[chosen]
+        linked = fields if len(chosen) == len(fields) else fields.take(chosen, axis=0)
         if self._num + len(chosen) > len(self._open[0]):
             self._full.append(self._written)
             self._open, self._num = _no_linked(max(len(chosen), _MOST_AT_ONCE)), 0

@@ -11,7 +11,6 @@ from numpy.testing import assert_array_equal
 from sfm_audit.loaders.assembly import raw
 from sfm_audit.loaders.assembly.raw import UNLINKED, LinkedPoints, RawImage, image_columns
 from sfm_audit.loaders.colmap import binary_points
-from sfm_audit.loaders.colmap.binary_points import _point_starts as point_starts
 
 SIZES = (3, 0, 5, 1, 8)
 
@@ -52,6 +51,11 @@ def records(lengths):
         struct.pack("<Q3d3BdQ", i, 0.5, 0.5, 0.5, 7, 7, 7, 0.25, length) + b"\xff" * (8 * length)
         for i, length in enumerate(lengths)
     )
+
+
+def point_starts(data, max_count):
+    starts, end = binary_points._point_starts(data, max_count)
+    return starts.tolist(), end
 
 
 LENGTHS = ((), (2,), (300,), (255, 256, 257), (2, 3) * 40, (2,) * 40 + (1000,) + (3,) * 40, (300,) * 5, (0, 0, 65536))
