@@ -9,6 +9,9 @@
 
 enum { SIZE = 64, MONOMIALS = 15, HIGHEST = 10, LENS = 4, SHUTTER = 6, MAX_OWN = 32, MAX_ROWS = MAX_OWN + 1 + LENS + SHUTTER };
 enum { NUM_FEATURES = LENS + SHUTTER + 2 * MONOMIALS, MAX_FEATURES = MAX_OWN + NUM_FEATURES };
+/* x, y, x^2, y^2 .. y^4: these times the five monomials of degree 4 are all of degree 5 .. 8. */
+enum { POWERS = 8, FIVE = 5 };
+static const int POWER[POWERS] = {1, 2, 3, 5, 6, 9, 10, 14};
 /* Numbers of an image: quaternion, translation, 3 x 3 from world gradients to the camera's, fx fy cx cy width height. */
 enum { QUAT = 0, SHIFT = 4, TURN = 7, LENS_NUMBERS = 16, NUM_NUMBERS = 22 };
 /* Facts of the camera model: distortion parameters, of which these are the radial and tangential groups (-1: none). */
@@ -30,15 +33,18 @@ typedef struct {
     const double *numbers, *d_extra;
 } image_t;
 
-/* x, y: N, residual, S, R along x and y.   m: monomials.   Zero behind the observations that there are. */
+/* x, y: N, residual, S, R along x and y.   m: monomials.   Zero behind the observations that there are.
+ * rows: which they are in the model.   in_a_row: whether one stands behind the other there. */
 typedef struct {
     row_t x[MAX_ROWS], y[MAX_ROWS], m[MONOMIALS];
     int64_t rows[SIZE];
+    int in_a_row;
 } block_t;
 
-/* What stands for an observation in the meat: rows N w, S w, R w, m w_x, m w_y; moments of w_x^2, w_x w_y, w_y^2.   left: y - N c. */
+/* What stands for an observation in the meat: rows N w, S w, R w, m w_x, m w_y; squares: w_x^2, w_x w_y, w_y^2; powers: times
+ * powers of x and y.   left: y - N c. */
 typedef struct {
-    row_t g[MAX_FEATURES], squares[3 * MONOMIALS], w[2], left[2];
+    row_t g[MAX_FEATURES], squares[3], powers[3 * POWERS], w[2], left[2];
     double largest_leverage;
 } scores_t;
 
@@ -55,32 +61,51 @@ static void *aligned_scratch(size_t size, void **to_free) {
     return *to_free ? (void *)(((uintptr_t)*to_free + 63) & ~(uintptr_t)63) : NULL;
 }
 
-/* sums[r][c] += row r of a times row c of b. Lanes are added in fixed order. */
-INLINE void tile(const row_t *a, const row_t *b, const int rows, const int columns,
-                                                       double *sums, int64_t stride) {
-    lanes s[3][4] = {{{0}}};
+INLINE void copy_row(double *to, const double *from) {
+    for (int k = 0; k < SIZE; k += 8) {
+        const Lanes first = load(from + k), second = load(from + k + 4); /* a call of memcpy waits longer than it copies */
+        store(to + k, first), store(to + k + 4, second);
+    }
+}
+
+/* sums[r][c] += row r of a times row c of b, lane by lane: they are added when all is summed up (`sum`). */
+INLINE void tile(const row_t *a, const row_t *b, const int rows, const int columns, lanes *sums, int64_t stride) {
+    lanes s[3][8];
+    for (int r = 0; r < rows; ++r)
+        for (int c = 0; c < columns; ++c) s[r][c] = sums[r * stride + c];
     for (int k = 0; k < SIZE; k += 4)
         for (int r = 0; r < rows; ++r) {
             const lanes left = *(const lanes *)&a[r][k];
             for (int c = 0; c < columns; ++c) s[r][c] += left * *(const lanes *)&b[c][k];
         }
     for (int r = 0; r < rows; ++r)
-        for (int c = 0; c < columns; ++c)
-            sums[r * stride + c] += sum(s[r][c]);
+        for (int c = 0; c < columns; ++c) sums[r * stride + c] = s[r][c];
 }
 
-static WIDE void products(const row_t *a, int rows, const row_t *b, int columns, double *sums, int64_t stride) {
+/* All columns from ``c`` on, of a few rows. */
+INLINE void stripe(const row_t *a, const int rows, const row_t *b, int c, int columns, lanes *sums, int64_t stride) {
+    for (; rows == 1 && c + 8 <= columns; c += 8) tile(a, b + c, rows, 8, sums + c, stride);
+    for (; c + 4 <= columns; c += 4) tile(a, b + c, rows, 4, sums + c, stride);
+    if (columns - c == 3) tile(a, b + c, rows, 3, sums + c, stride);
+    if (columns - c == 2) tile(a, b + c, rows, 2, sums + c, stride);
+    if (columns - c == 1) tile(a, b + c, rows, 1, sums + c, stride);
+}
+
+/* Sums of each row of a times each row of b; of upper ones those below the diagonal are left as they come. */
+INLINE void stripes(const row_t *a, int rows, const row_t *b, int columns, lanes *sums, int64_t stride, const int upper) {
     int r = 0;
-    for (; r + 3 <= rows; r += 3) {
-        int c = 0;
-        for (; c + 4 <= columns; c += 4) tile(a + r, b + c, 3, 4, sums + r * stride + c, stride);
-        for (; c < columns; ++c) tile(a + r, b + c, 3, 1, sums + r * stride + c, stride);
-    }
-    for (; r < rows; ++r) {
-        int c = 0;
-        for (; c + 4 <= columns; c += 4) tile(a + r, b + c, 1, 4, sums + r * stride + c, stride);
-        for (; c < columns; ++c) tile(a + r, b + c, 1, 1, sums + r * stride + c, stride);
-    }
+    for (; r + 3 <= rows; r += 3) stripe(a + r, 3, b, upper * r, columns, sums + r * stride, stride);
+    if (rows - r == 2) stripe(a + r, 2, b, upper * r, columns, sums + r * stride, stride);
+    if (rows - r == 1) stripe(a + r, 1, b, upper * r, columns, sums + r * stride, stride);
+}
+
+static WIDE void products(const row_t *a, int rows, const row_t *b, int columns, lanes *sums, int64_t stride) {
+    stripes(a, rows, b, columns, sums, stride, 0);
+}
+
+/* The same where the first rows of b are those of a: what lies below the diagonal is not used. */
+static WIDE void upper_products(const row_t *a, int rows, int columns, lanes *sums, int64_t stride) {
+    stripes(a, rows, a, columns, sums, stride, 1);
 }
 
 /* Monomials of (x, y), by degree, then by the power of y. */
@@ -118,11 +143,18 @@ INLINE void fill_points(const model_t *model, const image_t *image, const block_
     }
 }
 
+/* Numbers of the observations of a block, where that of row ``first`` is from[0]. */
+INLINE void take(const double *from, int64_t first, const block_t *b, double *to) {
+    if (b->in_a_row) copy_row(to, from + (b->rows[0] - first));
+    for (int k = 0; !b->in_a_row && k < SIZE; ++k) to[k] = from[b->rows[k] - first];
+}
+
 INLINE void fill_gradient(const model_t *model, const image_t *image, const block_t *b, int axis, row_t *gradient) {
-    const double *turn = image->numbers + TURN, *from = model->jacobian + 3 * axis * model->jacobian_stride;
+    const double *turn = image->numbers + TURN;
+    row_t world[3];
+    for (int j = 0; j < 3; ++j) take(model->jacobian + (3 * axis + j) * model->jacobian_stride, 0, b, world[j]);
     for (int k = 0; k < SIZE; ++k) {
-        const double *own = from + b->rows[k];
-        const double x = own[0], y = own[model->jacobian_stride], z = own[2 * model->jacobian_stride];
+        const double x = world[0][k], y = world[1][k], z = world[2][k];
         for (int j = 0; j < 3; ++j) gradient[j][k] = turn[3 * j] * x + turn[3 * j + 1] * y + turn[3 * j + 2] * z;
     }
 }
@@ -154,13 +186,13 @@ INLINE void fill_lens(row_t *x, row_t *y, const double *ux, const double *uy, co
 INLINE void fill_extra(const image_t *image, const block_t *b, int idx, double *x, double *y) {
     const int64_t num = image->stop - image->start;
     const double *along_x = image->d_extra + 2 * idx * num, *along_y = along_x + num;
-    for (int k = 0; k < SIZE; ++k) x[k] = along_x[b->rows[k] - image->start], y[k] = along_y[b->rows[k] - image->start];
+    take(along_x, image->start, b, x), take(along_y, image->start, b, y);
 }
 
 INLINE void fill_focals(block_t *b, int num_focals, const double *vx, const double *vy) {
-    memcpy(b->x[6], vx, sizeof(row_t)), memcpy(b->y[6], vy, sizeof(row_t));
+    copy_row(b->x[6], vx), copy_row(b->y[6], vy);
     if (num_focals < 2) return;
-    memcpy(b->y[7], vy, sizeof(row_t));
+    copy_row(b->y[7], vy);
     memset(b->y[6], 0, sizeof(row_t)), memset(b->x[7], 0, sizeof(row_t));
 }
 
@@ -177,9 +209,9 @@ static WIDE void evaluate(const model_t *model, const image_t *image, int count,
         fill_gradient(model, image, b, axis, gradient);
         fill_pose(axis ? b->y : b->x, (const row_t *)gradient, (const row_t *)point);
     }
+    take(model->residuals, 0, b, b->x[q]), take(model->residuals + model->residual_stride, 0, b, b->y[q]);
     for (int k = 0; k < SIZE; ++k) {
         const double *seen = model->xy_px + 2 * model->observation[b->rows[k]];
-        b->x[q][k] = model->residuals[b->rows[k]], b->y[q][k] = model->residuals[model->residual_stride + b->rows[k]];
         px[k] = seen[0] - b->x[q][k], py[k] = seen[1] - b->y[q][k];
     }
     for (int k = 0; k < SIZE; ++k) {
@@ -207,42 +239,57 @@ static WIDE void evaluate(const model_t *model, const image_t *image, int count,
 static int fill_rows(int64_t from, int64_t stop, block_t *b) {
     const int count = stop - from < SIZE ? (int)(stop - from) : SIZE;
     for (int k = 0; k < count; ++k) b->rows[k] = from + k;
+    b->in_a_row = count == SIZE;
     return count;
 }
 
-/* The sum of m_i m_j: low[j] has the moments of degree 0 .. 4, high[i][j] those of m_(10 + i) m_j. */
-static double moment(const double *low, const double *high, int64_t stride, int i, int j) {
-    int degree = 0, power = 0;
+/* What lies anywhere in memory of an observation that is evaluated soon. */
+INLINE void ask_ahead(const model_t *model, int64_t row) {
+    SOON(model->xyz_world + 3 * model->point[row]), SOON(model->xy_px + 2 * model->observation[row]);
+}
+
+/* `fill_rows`, while the observations after these are on their way. */
+static int next_rows(const model_t *model, const image_t *image, int64_t from, block_t *b) {
+    const int64_t stop = image->stop < from + 2 * SIZE ? image->stop : from + 2 * SIZE;
+    for (int64_t row = from + SIZE; row < stop; ++row) ask_ahead(model, row);
+    return fill_rows(from, image->stop, b);
+}
+
+/* The sum of m_i m_j: low has the moments of degree 0 .. 4, row i of high those of m_(10 + i) times the powers. */
+static double moment(const lanes *low, const lanes *high, int64_t stride, int i, int j) {
+    int degree = 0, power = 0; /* of y */
     for (int k = 0; k < 2; ++k) {
         const int own = k ? j : i;
         int d = 0;
         while ((d + 1) * (d + 2) / 2 <= own) ++d;
         degree += d, power += own - d * (d + 1) / 2;
     }
-    if (degree <= 4) return low[degree * (degree + 1) / 2 + power];
-    const int above = degree - 4, first = power < 4 ? power : 4;
-    return high[first * stride + above * (above + 1) / 2 + power - first];
+    if (degree <= 4) return sum(low[degree * (degree + 1) / 2 + power]);
+    const int above = degree - 4, of_y = power > 4;
+    return sum(high[(of_y ? power - above : power) * stride + 2 * (above - 1) + of_y]);
 }
 
 static void set(double *out, int64_t size, int i, int j, double value) { out[i * size + j] = value, out[j * size + i] = value; }
 
 typedef struct {
-    double own[MAX_OWN * MAX_ROWS], on_y[LENS + SHUTTER], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
-    double along_x[MONOMIALS * (MAX_OWN + 1)], along_y[MONOMIALS * (MAX_OWN + 1)], low[MONOMIALS], high[5 * MONOMIALS];
+    lanes own[MAX_OWN * MAX_ROWS], on_y[LENS + SHUTTER], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
+    lanes along_x[MONOMIALS * (MAX_OWN + 1)], along_y[MONOMIALS * (MAX_OWN + 1)], low[MONOMIALS], high[FIVE * POWERS];
 } sums_t;
 
 static void add_block(sums_t *s, const block_t *b, int q) {
+    row_t powers[POWERS];
+    for (int j = 0; j < POWERS; ++j) copy_row(powers[j], b->m[POWER[j]]);
     const int num_rows = q + 1 + LENS + SHUTTER, lens = q + 1, shutter = lens + LENS;
     for (int axis = 0; axis < 2; ++axis) {
         const row_t *rows = axis ? b->y : b->x;
-        products(rows, q, rows, num_rows, s->own, MAX_ROWS);
+        upper_products(rows, q, num_rows, s->own, MAX_ROWS);
         products(rows + q, 1, rows + lens, LENS + SHUTTER, s->on_y, LENS + SHUTTER);
-        products(rows + lens, LENS, rows + lens, LENS, s->lens, LENS);
-        products(rows + shutter, SHUTTER, rows + shutter, SHUTTER, s->shutter, SHUTTER);
+        upper_products(rows + lens, LENS, LENS, s->lens, LENS);
+        upper_products(rows + shutter, SHUTTER, SHUTTER, s->shutter, SHUTTER);
         products(b->m, MONOMIALS, rows, q + 1, axis ? s->along_y : s->along_x, MAX_OWN + 1);
     }
     products(b->m, 1, b->m, MONOMIALS, s->low, MONOMIALS);
-    products(b->m + HIGHEST, 5, b->m, MONOMIALS, s->high, MONOMIALS);
+    products(b->m + HIGHEST, FIVE, (const row_t *)powers, POWERS, s->high, POWERS);
 }
 
 /* gram (q + 40, q + 40) and on_y (q + 40); what the tests do not use stays zero. */
@@ -251,24 +298,24 @@ static void write_sums(const sums_t *s, int q, double *gram, double *on_y) {
     const int shutter = q + LENS, along_x = shutter + SHUTTER, along_y = along_x + MONOMIALS;
     memset(gram, 0, sizeof(double) * (size_t)(size * size));
     for (int i = 0; i < q; ++i) {
-        for (int j = 0; j <= i; ++j) set(gram, size, i, j, s->own[j * MAX_ROWS + i]);
-        for (int j = 0; j < LENS + SHUTTER; ++j) set(gram, size, i, q + j, s->own[i * MAX_ROWS + q + 1 + j]);
-        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_x + j, s->along_x[j * (MAX_OWN + 1) + i]);
-        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_y + j, s->along_y[j * (MAX_OWN + 1) + i]);
-        on_y[i] = s->own[i * MAX_ROWS + q];
+        for (int j = 0; j <= i; ++j) set(gram, size, i, j, sum(s->own[j * MAX_ROWS + i]));
+        for (int j = 0; j < LENS + SHUTTER; ++j) set(gram, size, i, q + j, sum(s->own[i * MAX_ROWS + q + 1 + j]));
+        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_x + j, sum(s->along_x[j * (MAX_OWN + 1) + i]));
+        for (int j = 0; j < MONOMIALS; ++j) set(gram, size, i, along_y + j, sum(s->along_y[j * (MAX_OWN + 1) + i]));
+        on_y[i] = sum(s->own[i * MAX_ROWS + q]);
     }
     for (int i = 0; i < LENS; ++i)
-        for (int j = 0; j <= i; ++j) set(gram, size, q + i, q + j, s->lens[i * LENS + j]);
+        for (int j = 0; j <= i; ++j) set(gram, size, q + i, q + j, sum(s->lens[j * LENS + i]));
     for (int i = 0; i < SHUTTER; ++i)
-        for (int j = 0; j <= i; ++j) set(gram, size, shutter + i, shutter + j, s->shutter[i * SHUTTER + j]);
+        for (int j = 0; j <= i; ++j) set(gram, size, shutter + i, shutter + j, sum(s->shutter[j * SHUTTER + i]));
     for (int i = 0; i < MONOMIALS; ++i)
         for (int j = 0; j <= i; ++j) {
-            const double value = moment(s->low, s->high, MONOMIALS, i, j);
+            const double value = moment(s->low, s->high, POWERS, i, j);
             set(gram, size, along_x + i, along_x + j, value), set(gram, size, along_y + i, along_y + j, value);
         }
-    for (int j = 0; j < LENS + SHUTTER; ++j) on_y[q + j] = s->on_y[j];
-    for (int j = 0; j < MONOMIALS; ++j) on_y[along_x + j] = s->along_x[j * (MAX_OWN + 1) + q];
-    for (int j = 0; j < MONOMIALS; ++j) on_y[along_y + j] = s->along_y[j * (MAX_OWN + 1) + q];
+    for (int j = 0; j < LENS + SHUTTER; ++j) on_y[q + j] = sum(s->on_y[j]);
+    for (int j = 0; j < MONOMIALS; ++j) on_y[along_x + j] = sum(s->along_x[j * (MAX_OWN + 1) + q]);
+    for (int j = 0; j < MONOMIALS; ++j) on_y[along_y + j] = sum(s->along_y[j * (MAX_OWN + 1) + q]);
 }
 
 /* What all kernels here begin with: images, whose observations are rows[2 i] .. rows[2 i + 1] - 1, and the model. */
@@ -296,7 +343,7 @@ KERNEL int64_t sfm_misfit_sums(WINDOW, double *gram, double *on_y) {
         sums_t sums;
         memset(&sums, 0, sizeof sums);
         for (int64_t from = image.start; from < image.stop; from += SIZE) {
-            evaluate(&model, &image, fill_rows(from, image.stop, block), block);
+            evaluate(&model, &image, next_rows(&model, &image, from, block), block);
             add_block(&sums, block, q);
         }
         write_sums(&sums, q, gram + i * size * size, on_y + i * size);
@@ -327,10 +374,10 @@ static WIDE void weigh(const block_t *b, int q, const double *basis, int num, co
             *(lanes *)&leverage[k] = first, *(lanes *)&leverage[k + 4] = second;
         }
         for (int k = 0; k < SIZE; ++k) largest = leverage[k] > largest ? leverage[k] : largest;
-        memcpy(s->w[axis], own[q], sizeof(row_t));
+        copy_row(s->w[axis], own[q]);
         for (int j = 0; j < q; ++j)
             for (int k = 0; k < SIZE; ++k) s->w[axis][k] -= c[j] * own[j][k];
-        memcpy(s->left[axis], s->w[axis], sizeof(row_t));
+        copy_row(s->left[axis], s->w[axis]);
         for (int k = 0; k < SIZE; ++k)
             s->w[axis][k] /= sqrt(1.0 - (leverage[k] < MAX_LEVERAGE ? leverage[k] : MAX_LEVERAGE));
     }
@@ -350,37 +397,37 @@ static WIDE void fill_scores(const block_t *b, int q, scores_t *s) {
 }
 
 typedef struct {
-    double own[MAX_OWN * MAX_FEATURES], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
-    double low[3 * MONOMIALS], high[5 * 3 * MONOMIALS], smooth[4 * MONOMIALS * MONOMIALS];
+    lanes own[MAX_OWN * MAX_FEATURES], lens[LENS * LENS], shutter[SHUTTER * SHUTTER];
+    lanes low[3 * MONOMIALS], high[FIVE * 3 * POWERS], smooth[4 * MONOMIALS * MONOMIALS];
 } meat_t;
 
 static void add_own(meat_t *meat, const row_t *g, int q) {
-    products(g, q, g, q + NUM_FEATURES, meat->own, MAX_FEATURES);
-    products(g + q, LENS, g + q, LENS, meat->lens, LENS);
-    products(g + q + LENS, SHUTTER, g + q + LENS, SHUTTER, meat->shutter, SHUTTER);
+    upper_products(g, q, q + NUM_FEATURES, meat->own, MAX_FEATURES);
+    upper_products(g + q, LENS, LENS, meat->lens, LENS);
+    upper_products(g + q + LENS, SHUTTER, SHUTTER, meat->shutter, SHUTTER);
 }
 
-static WIDE void fill_squares(scores_t *s, int q) {
-    const row_t *along_x = (const row_t *)s->g + q + LENS + SHUTTER, *along_y = along_x + MONOMIALS;
+static WIDE void fill_squares(const block_t *b, scores_t *s) {
     const double *wx = s->w[0], *wy = s->w[1];
-    row_t *xx = s->squares, *xy = xx + MONOMIALS, *yy = xy + MONOMIALS;
-    for (int j = 0; j < MONOMIALS; ++j)
-        for (int k = 0; k < SIZE; ++k)
-            xx[j][k] = along_x[j][k] * wx[k], xy[j][k] = along_x[j][k] * wy[k], yy[j][k] = along_y[j][k] * wy[k];
+    for (int k = 0; k < SIZE; ++k)
+        s->squares[0][k] = wx[k] * wx[k], s->squares[1][k] = wx[k] * wy[k], s->squares[2][k] = wy[k] * wy[k];
+    for (int axes = 0; axes < 3; ++axes)
+        for (int j = 0; j < POWERS; ++j)
+            for (int k = 0; k < SIZE; ++k) s->powers[axes * POWERS + j][k] = b->m[POWER[j]][k] * s->squares[axes][k];
 }
 
 static void add_single(meat_t *meat, const block_t *b, scores_t *s, int q) {
     add_own(meat, (const row_t *)s->g, q);
-    fill_squares(s, q);
-    products(b->m, 1, (const row_t *)s->squares, 3 * MONOMIALS, meat->low, 3 * MONOMIALS);
-    products(b->m + HIGHEST, 5, (const row_t *)s->squares, 3 * MONOMIALS, meat->high, 3 * MONOMIALS);
+    fill_squares(b, s);
+    products((const row_t *)s->squares, 3, b->m, MONOMIALS, meat->low, MONOMIALS);
+    products(b->m + HIGHEST, FIVE, (const row_t *)s->powers, 3 * POWERS, meat->high, 3 * POWERS);
 }
 
 static void add_clusters(meat_t *meat, row_t *sums, int count, int q) {
     for (int j = 0; j < q + NUM_FEATURES; ++j) memset(&sums[j][count], 0, sizeof(double) * (size_t)(SIZE - count));
     add_own(meat, (const row_t *)sums, q);
     const row_t *smooth = (const row_t *)sums + q + LENS + SHUTTER;
-    products(smooth, 2 * MONOMIALS, smooth, 2 * MONOMIALS, meat->smooth, 2 * MONOMIALS);
+    upper_products(smooth, 2 * MONOMIALS, 2 * MONOMIALS, meat->smooth, 2 * MONOMIALS);
 }
 
 static void write_meat(const meat_t *meat, int q, double *out) {
@@ -388,17 +435,17 @@ static void write_meat(const meat_t *meat, int q, double *out) {
     const int shutter = q + LENS, smooth = shutter + SHUTTER;
     memset(out, 0, sizeof(double) * (size_t)(size * size));
     for (int i = 0; i < q; ++i)
-        for (int j = i; j < size; ++j) set(out, size, i, j, meat->own[i * MAX_FEATURES + j]);
+        for (int j = i; j < size; ++j) set(out, size, i, j, sum(meat->own[i * MAX_FEATURES + j]));
     for (int i = 0; i < LENS; ++i)
-        for (int j = 0; j <= i; ++j) set(out, size, q + i, q + j, meat->lens[i * LENS + j]);
+        for (int j = 0; j <= i; ++j) set(out, size, q + i, q + j, sum(meat->lens[j * LENS + i]));
     for (int i = 0; i < SHUTTER; ++i)
-        for (int j = 0; j <= i; ++j) set(out, size, shutter + i, shutter + j, meat->shutter[i * SHUTTER + j]);
+        for (int j = 0; j <= i; ++j) set(out, size, shutter + i, shutter + j, sum(meat->shutter[j * SHUTTER + i]));
     for (int i = 0; i < 2 * MONOMIALS; ++i)
         for (int j = 0; j <= i; ++j) {
             const int axes = (i >= MONOMIALS) + (j >= MONOMIALS); /* 0: w_x^2, 1: w_x w_y, 2: w_y^2 */
-            const double *low = meat->low + axes * MONOMIALS, *high = meat->high + axes * MONOMIALS;
-            const double single = moment(low, high, 3 * MONOMIALS, i % MONOMIALS, j % MONOMIALS);
-            set(out, size, smooth + i, smooth + j, single + meat->smooth[i * 2 * MONOMIALS + j]);
+            const lanes *low = meat->low + axes * MONOMIALS, *high = meat->high + axes * POWERS;
+            const double single = moment(low, high, 3 * POWERS, i % MONOMIALS, j % MONOMIALS);
+            set(out, size, smooth + i, smooth + j, single + sum(meat->smooth[j * 2 * MONOMIALS + i]));
         }
 }
 
@@ -454,6 +501,14 @@ static int find_clusters(const model_t *model, const image_t *image, clusters_t 
     return DONE;
 }
 
+/* Rows of members from the ``from``-th on; return how many. */
+static int member_rows(const image_t *image, const clusters_t *c, int64_t from, block_t *b) {
+    const int count = fill_rows(from, c->num_members, b);
+    for (int k = 0; k < count; ++k) b->rows[k] = image->start + c->members[from + k];
+    b->in_a_row = 0;
+    return count;
+}
+
 /* What the profiled N of an image is: rows of an orthonormal basis (num, q) of it, and c (q) with y~ = y - N c. */
 typedef struct {
     const double *basis, *on_y;
@@ -465,7 +520,7 @@ static void meat_of_singles(const model_t *model, const image_t *image, const pr
     const int q = own_columns(model->facts);
     block_t *b = &scratch->block;
     for (int64_t from = image->start; from < image->stop; from += SIZE) {
-        const int count = fill_rows(from, image->stop, b);
+        const int count = next_rows(model, image, from, b);
         evaluate(model, image, count, b);
         weigh(b, q, profile->basis, profile->num, profile->on_y, &scratch->scores);
         for (int k = 0; k < count; ++k)
@@ -481,8 +536,7 @@ static void meat_of_clusters(const model_t *model, const image_t *image, const p
     block_t *b = &scratch->block;
     int at = -1; /* the column of the pixel's sums */
     for (int64_t from = 0; from < c->num_members; from += SIZE) {
-        const int count = fill_rows(from, c->num_members, b);
-        for (int k = 0; k < count; ++k) b->rows[k] = image->start + c->members[from + k];
+        const int count = member_rows(image, c, from, b);
         evaluate(model, image, count, b);
         weigh(b, q, profile->basis, profile->num, profile->on_y, &scratch->scores);
         fill_scores(b, q, &scratch->scores);
@@ -535,7 +589,7 @@ KERNEL int64_t sfm_misfit_meat(WINDOW, const double *basis, const double *on_y, 
 enum { SMOOTH = 2 * (MONOMIALS - 1) };
 typedef struct {
     row_t u[2][SMOOTH], g[SMOOTH], clusters[SMOOTH];
-    double gram[SMOOTH * SMOOTH], on_y[SMOOTH], meat[SMOOTH * SMOOTH];
+    lanes gram[SMOOTH * SMOOTH], on_y[SMOOTH], meat[SMOOTH * SMOOTH];
 } mixed_t;
 
 typedef struct {
@@ -586,23 +640,22 @@ static void add_mixed(const model_t *model, const image_t *image, const profile_
     block_t *b = &scratch->common.block;
     mixed_t *m = &scratch->mixed;
     for (int64_t from = image->start; from < image->stop; from += SIZE) {
-        mixed_block(model, image, profile, mixing, fill_rows(from, image->stop, b), scratch, c);
+        mixed_block(model, image, profile, mixing, next_rows(model, image, from, b), scratch, c);
         for (int axis = 0; axis < 2; ++axis) {
             const row_t *u = (const row_t *)m->u[axis];
-            products(u, SMOOTH, u, SMOOTH, m->gram, SMOOTH);
+            upper_products(u, SMOOTH, SMOOTH, m->gram, SMOOTH);
             products((const row_t *)scratch->common.scores.left + axis, 1, u, SMOOTH, m->on_y, SMOOTH);
         }
-        products((const row_t *)m->g, SMOOTH, (const row_t *)m->g, SMOOTH, m->meat, SMOOTH);
+        upper_products((const row_t *)m->g, SMOOTH, SMOOTH, m->meat, SMOOTH);
     }
     int at = -1;
     for (int64_t from = 0; from < c->num_members; from += SIZE) {
-        const int count = fill_rows(from, c->num_members, b);
-        for (int k = 0; k < count; ++k) b->rows[k] = image->start + c->members[from + k];
+        const int count = member_rows(image, c, from, b);
         mixed_block(model, image, profile, mixing, count, scratch, NULL);
         for (int k = 0; k < count; ++k) {
             const int starts = c->head[c->members[from + k]] == c->members[from + k];
             if (starts && at == SIZE - 1) {
-                products((const row_t *)m->clusters, SMOOTH, (const row_t *)m->clusters, SMOOTH, m->meat, SMOOTH);
+                upper_products((const row_t *)m->clusters, SMOOTH, SMOOTH, m->meat, SMOOTH);
                 at = -1;
             }
             at += starts;
@@ -611,7 +664,7 @@ static void add_mixed(const model_t *model, const image_t *image, const profile_
     }
     for (int j = 0; at >= 0 && j < SMOOTH; ++j)
         for (int k = at + 1; k < SIZE; ++k) m->clusters[j][k] = 0.0;
-    if (at >= 0) products((const row_t *)m->clusters, SMOOTH, (const row_t *)m->clusters, SMOOTH, m->meat, SMOOTH);
+    if (at >= 0) upper_products((const row_t *)m->clusters, SMOOTH, SMOOTH, m->meat, SMOOTH);
 }
 
 /* The smooth fields of images whose digits do not last in plain sums: Gram matrix, products with y - N c, meat. */
@@ -635,8 +688,12 @@ KERNEL int64_t sfm_misfit_mixed(WINDOW, const double *basis, const double *on_y,
         status = find_clusters(&model, &image, &clusters);
         memset(m->gram, 0, sizeof m->gram), memset(m->on_y, 0, sizeof m->on_y), memset(m->meat, 0, sizeof m->meat);
         if (status == DONE) add_mixed(&model, &image, &profile, &mixing, &clusters, scratch);
-        memcpy(gram + i * SMOOTH * SMOOTH, m->gram, sizeof m->gram);
-        memcpy(scores + i * SMOOTH, m->on_y, sizeof m->on_y), memcpy(meat + i * SMOOTH * SMOOTH, m->meat, sizeof m->meat);
+        for (int j = 0; j < SMOOTH; ++j) scores[i * SMOOTH + j] = sum(m->on_y[j]);
+        for (int j = 0; j < SMOOTH; ++j)
+            for (int k = j; k < SMOOTH; ++k) {
+                set(gram + i * SMOOTH * SMOOTH, SMOOTH, j, k, sum(m->gram[j * SMOOTH + k]));
+                set(meat + i * SMOOTH * SMOOTH, SMOOTH, j, k, sum(m->meat[j * SMOOTH + k]));
+            }
     }
     free(to_free), free(clusters.memory);
     return status;
@@ -676,6 +733,7 @@ KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows
                 count += track >= first && track < last;
             }
             if (!count) break;
+            b->in_a_row = 0;
             evaluate(&model, &image, count, b);
             weigh(b, q, basis + i * basis_rows * q, (int)basis_rows, on_y + i * q, &scratch->scores);
             fill_scores(b, q, &scratch->scores);
