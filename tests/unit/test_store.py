@@ -128,6 +128,29 @@ def test_another_version_or_other_labels_make_a_model_unfinished(tmp_path):
         assert store.finished(A) == STATE
 
 
+def test_a_model_of_other_settings_is_unfinished_where_nothing_else_says_which_they_were(tmp_path):
+    write_run(tmp_path, [A])
+    (tmp_path / "run.json").unlink()  # as its message advises where it is damaged
+    with RunStore(tmp_path, settings(alpha=0.1)) as store:
+        assert store.finished(A) is None
+
+
+def test_a_model_is_finished_with_observations_only_where_they_are_there(tmp_path):
+    write_run(tmp_path, [A])
+    with RunStore(tmp_path, replace(settings(), observations=True)) as store:
+        assert store.finished(A) is None
+        assert store.finished(B) is None
+
+
+def test_a_line_that_names_two_models_finishes_neither(tmp_path):
+    write_run(tmp_path, [A])
+    path = tmp_path / "manifest.jsonl"
+    path.write_text(path.read_text(encoding="utf-8").replace("}\n", f', "key": "{B.key}"}}\n'), encoding="utf-8")
+    with RunStore(tmp_path, settings()) as store:
+        assert store.finished(A) is None
+        assert store.finished(B) is None
+
+
 def test_a_rewritten_model_is_unfinished_until_its_last_part(tmp_path, monkeypatch):
     write_run(tmp_path, [A])
     write = store_module.write_whole
@@ -209,6 +232,16 @@ def test_models_that_are_no_longer_there_are_removed_at_the_end(tmp_path):
         store.finish([A.key], [], 1.0)
     assert set(part_times(tmp_path)) == {f"{name}/part-{A.key}.parquet" for name in ("images", "cameras", "models")}
     assert run_json(tmp_path)["counts"]["num_models"] == 1
+
+
+def test_a_model_that_is_not_to_be_kept_is_in_no_table_and_no_count(tmp_path):
+    with RunStore(tmp_path, settings()) as store:
+        for ref in (A, B):
+            store.write(ref, STATE, sample_tables(ref), 0.5)
+        store.finish([B.key], [], 1.0)
+    assert [entry["key"] for entry in manifest(tmp_path)] == [B.key]
+    assert run_json(tmp_path)["counts"]["num_images"] == 2
+    assert len(list(RunReader.open(tmp_path).rows("images", ["image_name"]))) == 2
 
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
