@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import audit_stubs
@@ -9,7 +10,7 @@ from run_samples import write_models
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.schedule import task as task_module
 from sfm_audit.audit.schedule.runner import Failure, Limits, audit_many, audit_one
-from sfm_audit.loaders import discover
+from sfm_audit.loaders import LoadError, discover
 from sfm_audit.loaders.datasets.input_state import InputState, input_stamp, read_input_state
 
 
@@ -162,6 +163,50 @@ def test_a_model_that_takes_too_much_memory_is_ended_and_the_others_are_not(refs
     assert (failure.location, failure.kind) == (refs[1].model_path, "memory")
     assert "GB of memory (--max-model-memory)" in failure.message
     assert len(sink.tables) == 3
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("limits", [Limits(seconds=5.0), Limits(memory_bytes=10**9), Limits(input_bytes=10**9)])
+def test_a_model_with_limits_on_memory_or_time_is_watched_from_another_process(refs, monkeypatch, jobs, limits):
+    started = []
+
+    def in_processes(plan, _jobs, _audit):
+        started.extend(task.ref for task in plan)
+        return iter(())
+
+    monkeypatch.setattr("sfm_audit.audit.schedule.runner.in_processes", in_processes)
+    sink = Memory()
+    audit_many(refs[:1], AuditConfig(), jobs=jobs, sink=sink, limits=limits)
+    needed = limits.seconds is not None or limits.memory_bytes is not None
+    assert (len(started), len(sink.tables)) == ((1, 0) if needed else (0, 1))
+
+
+def test_a_model_whose_files_are_larger_than_allowed_is_not_audited(refs):
+    size, *others = (ref.num_bytes for ref in refs)
+    limits = Limits(input_bytes=max(size, *others))
+    assert audit_many(refs, AuditConfig(), jobs=1, sink=Memory(), limits=limits) == []
+    larger = replace(refs[1], num_bytes=limits.input_bytes + 1)
+    audited = []
+    audit = lambda task: audited.append(task.ref) or audit_one(task)  # noqa: E731
+    sink = Memory()
+    given = [refs[0], larger, *refs[2:]]
+    (failure,) = audit_many(given, AuditConfig(), jobs=1, sink=sink, audit=audit, limits=limits)
+    assert (failure.location, failure.kind) == (refs[1].model_path, "too_large")
+    assert audited == [refs[0], *refs[2:]]
+    assert sink.dropped == [larger.key]
+
+
+def test_a_model_whose_files_cannot_be_looked_at_is_asked_again(refs, monkeypatch):
+    def stamp(location):
+        raise LoadError(location, None, "a location", "none", "")
+
+    sink = Memory()
+    run(refs[:1], sink)
+    monkeypatch.setattr("sfm_audit.audit.schedule.runner.input_stamp", stamp)
+    asked = []
+    audit = lambda task: asked.append(task.known_digest) or audit_one(task)  # noqa: E731
+    run([replace(refs[0], stamp="")], sink, audit=audit)
+    assert asked == [sink.states[refs[0].key].digest]
 
 
 def test_verify_reads_what_sizes_and_times_hide(refs):
