@@ -87,6 +87,7 @@ class CameraQuality:
     """What one image says of its camera, the points taken as given.
 
     misfit: as the model stands.    expected_error_px: median over the image.    median_depth: model units.
+    sums: what the misfit was made of (`audit.misfit.features.packed`), where it may be asked for again.
     """
 
     shape: CameraShape
@@ -96,6 +97,7 @@ class CameraQuality:
     median_depth: float
     coverage: float
     occupied_cells: int
+    sums: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,13 +105,14 @@ class PointSums:
     """What the inliers of an image add up to, for what they say of its camera beside the misfit.
 
     gram: (q, q) of the columns of `fitted_names`.    num_values: of each column.    median_depth: model units.
-    triangle: gives `unit_triangle` of the columns, given their lengths.
+    triangle: gives `unit_triangle` of the columns, given their lengths.    misfit: as `CameraQuality.sums`.
     """
 
     gram: FloatArray
     num_values: int
     median_depth: float
     triangle: Callable[[FloatArray], FloatArray]
+    misfit: FloatArray | None = None
 
 
 def camera_quality(shape: CameraShape, inliers: ImageInliers, sigma_px: float, *, grid: int) -> CameraQuality | None:
@@ -203,7 +206,13 @@ def qualities_of(
     depth = np.array([each.median_depth for each in sums], dtype=np.float64)
     errors = expected_errors_px(shapes, parameters, sigma_px, depth)
     known = [identifiability_of(shape.camera, own) for shape, own in zip(shapes, parameters, strict=True)]
-    columns = errors.tolist(), depth.tolist(), seen.coverage.tolist(), seen.occupied_cells.tolist()
+    columns = (
+        errors.tolist(),
+        depth.tolist(),
+        seen.coverage.tolist(),
+        seen.occupied_cells.tolist(),
+        [each.misfit for each in sums],
+    )
     return list(map(CameraQuality, shapes, misfits, known, *columns))
 
 

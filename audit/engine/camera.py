@@ -149,7 +149,8 @@ def audit_cameras(
     """
     audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
     groups = _groups_of(model, residuals, audited)
-    source = ModelSums(model, residuals)
+    sums = {i: each.sums for i, each in enumerate(quality) if each is not None and each.sums is not None}
+    source = ModelSums(model, residuals, sums)
     tests = [_pooled(source, group.only(holds), quality) for group in groups]
     significance = Significance.of(tests)
     of_cameras = [

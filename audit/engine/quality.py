@@ -99,7 +99,8 @@ def _sums_of(
             alike.setdefault((int(model.images.camera_idx[image_idx]), num_inliers), []).append(place)
         elif image_idx in tested:
             triangle, far = partial(_triangle_of, model, residuals, image_idx), float(depth[place])
-            out[place] = tested[image_idx].tests, PointSums(tested[image_idx].gram, 2 * num_inliers, far, triangle)
+            tests, gram, known = tested[image_idx]
+            out[place] = tests, PointSums(gram, 2 * num_inliers, far, triangle, known)
         elif num_inliers <= AT_ONCE:
             out[place] = image_sums(shape.camera, image_inliers(model, residuals, image_idx))
         else:

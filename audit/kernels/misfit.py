@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
 NUM_FEATURES: Final = 40
 NUM_SMOOTH: Final = 28
@@ -170,9 +170,9 @@ def misfit_mixed(
 
 
 class Tracks(NamedTuple):
-    """Which tracks are asked for: those numbered first .. last - 1; of_point: (P,) number of each point's track."""
+    """Which tracks are asked for: those numbered first .. last - 1; of_row: (n,) number of each observation's track."""
 
-    of_point: IntArray
+    of_row: Int32Array
     first: int
     last: int
 
@@ -190,7 +190,7 @@ def misfit_tracks(
     ----------
     profile : basis (k, r, q), on_y (k, q) as of `misfit_meat`, and (k, q, 40) coefficients of N in each feature
     """
-    function = kernel("sfm_misfit_tracks", *_WINDOW, Doubles, Size, Doubles, Doubles, Ints, Size, Size, Doubles)
+    function = kernel("sfm_misfit_tracks", *_WINDOW, Doubles, Size, Doubles, Doubles, SmallInts, Size, Size, Doubles)
     if function is None or window.num_own > MAX_OWN:
         return False
     num, q = len(window.rows), window.num_own
@@ -198,7 +198,7 @@ def misfit_tracks(
     _check("basis", basis, (num, basis.shape[1], q))
     _check("on_y", on_y, (num, q))
     _check("coefficients", coefficients, (num, q, NUM_FEATURES))
-    _check("tracks", tracks.of_point, (len(observed.xyz_world),))
+    _check("tracks", tracks.of_row, (len(observed.point_idx),))
     _check("per_track", per_track, (tracks.last - tracks.first, NUM_FEATURES))
     status = function(
         *_arguments(observed, window),
@@ -206,7 +206,7 @@ def misfit_tracks(
         basis.shape[1],
         on_y,
         coefficients,
-        tracks.of_point,
+        tracks.of_row,
         tracks.first,
         tracks.last,
         per_track,
@@ -253,11 +253,16 @@ def _side_by_side(arrays: tuple[FloatArray, ...]) -> tuple[FloatArray, IntArray]
     """One array (m,) that holds all of these, and where each begins: the one that all are views of, or a new one."""
     base = arrays[0].base if arrays else None
     if isinstance(base, np.ndarray) and base.ndim == 1 and base.dtype == np.float64 and base.flags.c_contiguous:
-        first = base.ctypes.data
+        first = _address(base)
         if all(each.base is base and each.flags.c_contiguous for each in arrays):
-            return base, np.array([(each.ctypes.data - first) // 8 for each in arrays], dtype=np.int64)
+            return base, np.array([(_address(each) - first) // 8 for each in arrays], dtype=np.int64)
     sizes = np.array([each.size for each in arrays], dtype=np.int64)
     return np.concatenate([np.ravel(each) for each in arrays] or [np.empty(0)]), np.cumsum(sizes) - sizes
+
+
+def _address(array: FloatArray) -> int:
+    """Where it begins in memory; ``array.ctypes.data`` takes ten times as long."""
+    return int(array.__array_interface__["data"][0])
 
 
 def _is_by_rows(array: FloatArray) -> bool:
@@ -267,6 +272,6 @@ def _is_by_rows(array: FloatArray) -> bool:
     return array.ndim == 2 or array.strides[0] == array.shape[1] * array.strides[1]
 
 
-def _check(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:
+def _check(name: str, array: FloatArray | IntArray | Int32Array, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise ValueError(f"{name} of shape {array.shape}, not {shape}")

@@ -18,9 +18,9 @@ from sfm_audit.audit.misfit.mixed import mix_of, transforms_of
 from sfm_audit.audit.misfit.outcome import MisfitTest, judged_by_chi2, not_tested, refusal
 from sfm_audit.audit.misfit.pooled import PooledNormal, PooledSolution, PooledTests, judged
 from sfm_audit.audit.misfit.stacked import LOST_DIGITS, LOST_OF_SMOOTH, profiled, ranks_of
-from sfm_audit.audit.misfit.sums import ModelSums
+from sfm_audit.audit.misfit.sums import ModelSums, NumberedTracks
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray
 
 _POSE: Final = 6
 _SMOOTH: Final = GROUP_COLUMNS[MisfitGroup.SMOOTH]
@@ -68,7 +68,7 @@ class _Pooled(NamedTuple):
     to_basis: (I, 6, 6) to_basis P is an orthonormal basis of each image's pose columns P.    on_y: (I, 6) y - P on_y
     is off P.    coefficients: (I, 6, k + 42) [C, E] - P coefficients is off P.
     subtracted: (k + 42, k + 42) sum of the squares of coefficients, all columns of unit length.
-    track_of_point: (P,) number of each point among those that are seen, -1 for others.    offset: `affine_offset`.
+    tracks: of the images.    offset: `affine_offset`.
     """
 
     normal: PooledNormal
@@ -76,7 +76,7 @@ class _Pooled(NamedTuple):
     on_y: FloatArray
     coefficients: FloatArray
     subtracted: FloatArray
-    track_of_point: IntArray
+    tracks: NumberedTracks
     offset: FloatArray
 
 
@@ -101,7 +101,7 @@ def _first_pass(source: ModelSums, images: Sequence[int]) -> _Pooled | None:
         offset = window.offset[0]
     scale = 1.0 / np.sqrt(np.diagonal(before))
     both = scale * scale[:, None]
-    track_of_point, num_tracks = source.tracks(images)
+    tracks = source.tracks(images)
     normal = PooledNormal(
         gram * both,
         before * both,
@@ -111,10 +111,10 @@ def _first_pass(source: ModelSums, images: Sequence[int]) -> _Pooled | None:
         2 * num_observations - _POSE * len(images),
         len(images),
         num_observations,
-        num_tracks,
+        tracks.num_tracks,
     )
     to_basis, profiled_y, coefficients = (np.concatenate(parts) for parts in zip(*profiles, strict=True))
-    return _Pooled(normal, to_basis, profiled_y, coefficients, subtracted * both, track_of_point, offset)
+    return _Pooled(normal, to_basis, profiled_y, coefficients, subtracted * both, tracks, offset)
 
 
 def _solution(first: _Pooled) -> PooledSolution | None:
@@ -211,12 +211,14 @@ def _meat(
     windows = list(source.windows(images)) if kernels_in_use() else None  # numpy's hold their features
     meat, mixed_meat = np.zeros((NUM_FEATURES, NUM_FEATURES)), np.zeros((0, 0) if mixed is None else mixed.mix.shape)
     for start in range(0, normal.num_tracks, at_once):
-        tracks = Tracks(first.track_of_point, start, min(start + at_once, normal.num_tracks))
+        tracks = Tracks(first.tracks.of_row, start, min(start + at_once, normal.num_tracks))
         per_track = np.zeros((tracks.last - tracks.first, NUM_FEATURES))
         at = 0
         for window in source.windows(images) if windows is None else windows:
             own = slice(at, at + len(window.images))
-            window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
+            lowest, highest = first.tracks.reach[own].T
+            if ((lowest < tracks.last) & (highest >= tracks.first)).any():
+                window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
             at = own.stop
         meat += per_track.T @ per_track
         if mixed is not None:

@@ -8,6 +8,7 @@ Monomials times monomials are moments, the same along x and y. `audit.kernels.mi
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -139,6 +140,34 @@ def sums_of(features: ImageFeatures) -> tuple[FloatArray, FloatArray]:
     of_features[ALONG_X, ALONG_X] = of_features[ALONG_Y, ALONG_Y] = moments
     on_y = np.concatenate([with_own[q, :q], with_own[q, q + 1 :], along_x[q], along_y[q]])
     return gram, on_y
+
+
+def packed(gram: FloatArray, on_y: FloatArray, num_own: int) -> FloatArray:
+    """Return what `sums_of` says of B images, (B, q + 40, q + 40), (B, q + 40), without what is told twice: (B, m)."""
+    row, column = _stored(num_own)
+    return np.concatenate([gram[:, row, column], on_y], axis=1)
+
+
+def unpacked(rows: FloatArray, num_own: int) -> tuple[FloatArray, FloatArray]:
+    """Return what `packed` was given, to the last bit."""
+    row, column = _stored(num_own)
+    size = num_own + NUM_FEATURES
+    gram = np.zeros((len(rows), size, size))
+    gram[:, row, column] = gram[:, column, row] = rows[:, : len(row)]
+    of_features = gram[:, num_own:, num_own:]
+    of_features[:, ALONG_Y, ALONG_Y] = of_features[:, ALONG_X, ALONG_X]
+    return gram, rows[:, len(row) :]
+
+
+@lru_cache(maxsize=32)
+def _stored(num_own: int) -> tuple[IntArray, IntArray]:
+    """Rows and columns of a Gram matrix of `sums_of` that `packed` takes."""
+    used = np.zeros((num_own + NUM_FEATURES,) * 2, dtype=np.bool_)
+    used[:num_own] = True
+    for block in (LENS, SHUTTER, ALONG_X):
+        used[num_own:, num_own:][block, block] = True
+    row, column = np.nonzero(np.triu(used))
+    return row.astype(np.int64), column.astype(np.int64)
 
 
 def _gram(rows: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.misfit.features import widened, widened_columns
+from sfm_audit.audit.misfit.features import packed, widened, widened_columns
 from sfm_audit.audit.misfit.mixed import smooth_tests
 from sfm_audit.audit.misfit.outcome import MisfitTests
 from sfm_audit.audit.misfit.stacked import Profiled, Sizes, profiled, tests_of_stack
@@ -25,23 +25,25 @@ _NOT_SMOOTH: Final = _ALL - {MisfitGroup.SMOOTH}
 
 
 class TestedImage(NamedTuple):
-    """tests: of the image as the model stands.    gram: (q, q) of N."""
+    """tests: of the image as it stands.    gram: (q, q) of N.    sums: `packed`, where others share its camera."""
 
     tests: MisfitTests
     gram: FloatArray
+    sums: FloatArray | None
 
 
 class _Stack(NamedTuple):
     """Images of one camera model, of one window or of several.
 
-    images: (B,) rows.    gram: (B, q + 40, q + 40).    found: profiled.    meat: (B, q + 42, q + 42).    leverage: (B,)
-    window: the only one, None of several.
+    images: (B,) rows.    gram: (B, q + 40, q + 40), on_y: (B, q + 40).    found: profiled.    meat: (B, q + 42, q + 42)
+    leverage: (B,)    window: the only one, None of several.
     """
 
     images: list[int]
     model_name: str
     num_own: int
     gram: FloatArray
+    on_y: FloatArray
     found: Profiled
     meat: FloatArray
     leverage: FloatArray
@@ -87,7 +89,18 @@ def _summed(window: WindowSums) -> _Stack:
     meat, leverage, num_clusters = window.meat(found.to_basis, found.on_y)
     sizes = Sizes(window.num_observations, num_clusters)
     return _Stack(
-        *(window.images, window.model_name, q, gram, found, widened(meat, window.offset, q), leverage, sizes, None)
+        *(
+            window.images,
+            window.model_name,
+            q,
+            gram,
+            on_y,
+            found,
+            widened(meat, window.offset, q),
+            leverage,
+            sizes,
+            None,
+        )
     )
 
 
@@ -99,6 +112,7 @@ def _joined(stacks: Sequence[_Stack]) -> _Stack:
     return first._replace(
         images=[image for each in stacks for image in each.images],
         gram=np.concatenate([each.gram for each in stacks]),
+        on_y=np.concatenate([each.on_y for each in stacks]),
         found=Profiled(*map(np.concatenate, zip(*(each.found for each in stacks), strict=True))),
         meat=np.concatenate([each.meat for each in stacks]),
         leverage=np.concatenate([each.leverage for each in stacks]),
@@ -116,9 +130,11 @@ def _tested(source: ModelSums, stack: _Stack) -> dict[int, TestedImage]:
         for b, test in zip(lacking, smooth_tests(found, images, q, mixed, sizes), strict=True):
             if test is not None:
                 tests[b] = {**(tests[b] or {}), MisfitGroup.SMOOTH: test}
+    shared = [b for b, image in enumerate(stack.images) if source.shares_camera(image)]
+    sums = dict(zip(shared, packed(stack.gram[shared], stack.on_y[shared], q), strict=True)) if shared else {}
     return {
-        image: TestedImage({group: test[group] for group in GROUPS}, own[:q, :q].copy())
-        for image, test, own in zip(stack.images, tests, stack.gram, strict=True)
+        image: TestedImage({group: test[group] for group in GROUPS}, own[:q, :q].copy(), sums.get(b))
+        for b, (image, test, own) in enumerate(zip(stack.images, tests, stack.gram, strict=True))
         if test is not None and test.keys() == _ALL
     }
 

@@ -19,7 +19,7 @@ from sfm_audit.audit.misfit.design import ImageDesign, OffPose, Piece, piece_of,
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS
 from sfm_audit.audit.misfit.outcome import MisfitTest, MisfitTests, judged_by_chi2, not_tested, refusal
 from sfm_audit.audit.table.words import GROUPS, MisfitGroup, MisfitStatus
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
 _SMALLEST_PIVOT: Final = 1e-8  # of the intrinsics' normal matrix, unit columns: below it, the triangular factor by QR
 
@@ -280,7 +280,7 @@ def scored(part: OffPose, normal: PooledNormal, solution: PooledSolution) -> tup
     return fields @ y, np.einsum("cin,in->nc", fields.reshape(len(fields), 2, -1), weighted)
 
 
-def add_rows(target: FloatArray, rows: IntArray, values: FloatArray, last_row: IntArray) -> None:
+def add_rows(target: FloatArray, rows: IntArray | Int32Array, values: FloatArray, last_row: IntArray) -> None:
     """Add values (n, c) to rows of target in place, also where a track is seen twice; last_row: scratch."""
     number = np.arange(len(rows))
     last_row[rows] = number

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,10 @@ from sfm_audit.audit.misfit.features import (
     image_features,
     meat_of,
     mixed_of,
+    packed,
     scores_of,
     sums_of,
+    unpacked,
     weights_of,
 )
 from sfm_audit.audit.misfit.fields import OWN_COEFFICIENTS
@@ -50,6 +52,18 @@ _MAX_OBSERVATIONS: Final = 1 << 17
 _FEW_OBSERVATIONS: Final = 1 << 14  # whose features are in memory at the same time
 
 
+class NumberedTracks(NamedTuple):
+    """Tracks of some images, numbered from 0.
+
+    of_row: (n,) number of each observation's track, of the rows of these images.    num_tracks: how many.
+    reach: (k, 2) smallest and largest number of each image; the second is below the first where it has none.
+    """
+
+    of_row: Int32Array
+    num_tracks: int
+    reach: IntArray
+
+
 class ModelSums:
     """Sums over the observations of images of one model, compiled where there are kernels.
 
@@ -58,11 +72,14 @@ class ModelSums:
     Parameters
     ----------
     model, residuals : the model and its inliers
+    known : by row of the image table, `packed` sums of images that were summed up before
     """
 
-    def __init__(self, model: SparseModel, residuals: ModelResiduals) -> None:
-        self.model, self.residuals = model, residuals
-        self._numbered: IntArray = np.empty(0, dtype=np.int64)
+    def __init__(
+        self, model: SparseModel, residuals: ModelResiduals, known: Mapping[int, FloatArray] | None = None
+    ) -> None:
+        self.model, self.residuals, self.known = model, residuals, known or {}
+        self._cameras: dict[int, CameraRecord] = {}
 
     @cached_property
     def observed(self) -> Observed:
@@ -78,7 +95,19 @@ class ModelSums:
 
     def camera(self, image: int) -> CameraRecord:
         """Of the image in this row, which has inliers."""
-        return self.model.camera(int(self.model.images.camera_idx[image]))
+        camera_idx = int(self.model.images.camera_idx[image])
+        if camera_idx not in self._cameras:
+            self._cameras[camera_idx] = self.model.camera(camera_idx)
+        return self._cameras[camera_idx]
+
+    def shares_camera(self, image: int) -> bool:
+        """Whether another image has the camera of the image in this row."""
+        return bool(self._num_images_of_camera[self.model.images.camera_idx[image]] > 1)
+
+    @cached_property
+    def _num_images_of_camera(self) -> IntArray:
+        camera_idx = self.model.images.camera_idx
+        return np.bincount(camera_idx[camera_idx >= 0], minlength=1)
 
     def num_of(self, image: int) -> int:
         """Inliers of the image in this row."""
@@ -121,20 +150,35 @@ class ModelSums:
     def _last_place(self) -> Int32Array:
         return np.empty(len(self.model.points), dtype=np.int32)  # read where it was just written
 
-    def tracks(self, images: Sequence[int]) -> tuple[IntArray, int]:
-        """Return the number of each point (P,) among those that these images see, -1 for others; how many they are.
+    def tracks(self, images: Sequence[int]) -> NumberedTracks:
+        """Number the points that these images see, in the order in which they first see them.
 
-        The array is used again when it is asked for again: cameras are many, and their points few.
+        Images beside each other mostly see the same points, whose numbers then lie near each other. Rows of other
+        images hold what an earlier question left: cameras are many, and their images few.
         """
-        points = self.points_of(images)
-        self._track_of_point[self._numbered] = -1
-        self._track_of_point[points] = np.arange(len(points))
-        self._numbered = points
-        return self._track_of_point, len(points)
+        of_point, of_row, num_tracks = self._track_of_point, self._track_of_row, 0
+        reach = np.empty((len(images), 2), dtype=np.int64)
+        for place, image in enumerate(images):
+            points = self.points(image)
+            new = points[of_point[points] < 0]
+            of_point[new] = number = np.arange(num_tracks, num_tracks + len(new), dtype=np.int32)
+            if not (of_point[new] == number).all():  # points that the image sees twice
+                new = distinct(new)
+                of_point[new] = number[: len(new)]
+            num_tracks += len(new)
+            of_row[self.residuals.rows(image)] = own = of_point[points]
+            reach[place] = own.min(initial=num_tracks), own.max(initial=-1)
+        for image in images:
+            of_point[self.points(image)] = -1
+        return NumberedTracks(of_row, num_tracks, reach)
 
     @cached_property
-    def _track_of_point(self) -> IntArray:
-        return np.full(len(self.model.points), -1, dtype=np.int64)
+    def _track_of_point(self) -> Int32Array:
+        return np.full(len(self.model.points), -1, dtype=np.int32)
+
+    @cached_property
+    def _track_of_row(self) -> Int32Array:
+        return np.full(len(self.residuals.point_idx), -1, dtype=np.int32)
 
     def can_sum(self, image: int) -> bool:
         """Whether the image in this row has fields, and room for its columns."""
@@ -209,13 +253,16 @@ class WindowSums:
         self.num_own = 6 + len(fitted_param_idxs(cameras[0].model))
         self.num_observations = np.array([source.num_of(image) for image in images], dtype=np.int64)
         self.model_name = cameras[0].model.name
-        self._source = source
-        self._window = source.window(images, cameras) if kernels_in_use() and self.num_own <= MAX_OWN else None
+        self._source, self._cameras = source, cameras
 
     @property
     def is_compiled(self) -> bool:
         """Whether kernels are asked; then no features are held."""
-        return self._window is not None
+        return kernels_in_use() and self.num_own <= MAX_OWN
+
+    @cached_property
+    def _window(self) -> Window | None:
+        return self._source.window(self.images, self._cameras) if self.is_compiled else None
 
     @cached_property
     def _features(self) -> list[ImageFeatures]:
@@ -223,6 +270,16 @@ class WindowSums:
 
     def sums(self) -> tuple[FloatArray, FloatArray]:
         """Return `sums_of` each image: (B, q + 40, q + 40) and (B, q + 40)."""
+        known = self._source.known
+        lacking = [image for image in self.images if image not in known]
+        if len(lacking) == len(self.images):
+            return self._summed()
+        if lacking:
+            own = packed(*WindowSums(self._source, lacking).sums(), self.num_own)
+            known = {**known, **dict(zip(lacking, own, strict=True))}
+        return unpacked(np.stack([known[image] for image in self.images]), self.num_own)
+
+    def _summed(self) -> tuple[FloatArray, FloatArray]:
         if self._window is not None and (found := misfit_sums(self._source.observed, self._window)) is not None:
             return found
         own = [sums_of(features) for features in self._features]
@@ -304,6 +361,6 @@ class WindowSums:
             basis, on_y, coefficients = (each[b] for each in profile)
             g = scores_of(features, weights_of(features, basis, on_y).weights)
             own = g[self.num_own :] - coefficients.T @ g[: self.num_own]
-            track = tracks.of_point[self._source.points(self.images[b])]
+            track = tracks.of_row[self._source.residuals.rows(self.images[b])]
             inside = (track >= tracks.first) & (track < tracks.last)
             add_rows(per_track, track[inside] - tracks.first, own.T[inside], last_row)

@@ -33,6 +33,25 @@ def test_points_are_counted_once_however_often_they_are_seen(num_points, images)
     assert source.num_points_of(images) == expected
 
 
+@pytest.mark.parametrize("images", [[0], [2], [3, 1], [0, 1], [4, 0, 2, 3], [0, 3, 4]])
+def test_tracks_are_numbered_as_they_are_seen(images):
+    source = sums_of(SEEN, 10)
+    source.tracks([4, 0])  # what an earlier question left behind does not count
+    of_row, num_tracks, reach = source.tracks(images)
+    numbers = [of_row[source.residuals.rows(image)].tolist() for image in images]
+    number_of = dict(zip((p for i in images for p in SEEN[i]), (t for own in numbers for t in own), strict=True))
+    assert numbers == [[number_of[point] for point in SEEN[image]] for image in images]
+    assert sorted(number_of.values()) == list(range(num_tracks))
+    firsts = [max(own, default=-1) for own in numbers]
+    assert all(max(own) < num_tracks for own in numbers if own)
+    assert reach.tolist() == [[min(own, default=num_tracks), last] for own, last in zip(numbers, firsts, strict=True)]
+    before: set[int] = set()
+    for image in images:
+        new = set(SEEN[image]) - before
+        assert {number_of[point] for point in new} == set(range(len(before), len(before) + len(new)))
+        before |= new
+
+
 def groups_of(strong, px, q=0.001):
     quiet = GroupDiagnostics(0.8, 0.05, -5.0, MisfitStatus.TESTED)
     return dict.fromkeys(GROUPS, quiet) | {strong: GroupDiagnostics(q, px, 30.0, MisfitStatus.TESTED)}

@@ -712,8 +712,32 @@ static WIDE void project_scores(scores_t *s, int q, const double *coefficients) 
         }
 }
 
+/* Adds what the observations of a block say to the rows of their tracks, four features of four observations at a time. */
+static WIDE void add_to_tracks(const row_t *g, int count, double *const *track) {
+    for (int k = 0; k < count; k += 4)
+        for (int j = 0; j < NUM_FEATURES; j += 4) {
+            Lanes part[4];
+            for (int i = 0; i < 4; ++i) part[i] = load(&g[j + i][k]);
+            transpose(part);
+            for (int i = 0; i < 4 && k + i < count; ++i) store(track[k + i] + j, load(track[k + i] + j) + part[i]);
+        }
+}
+
+/* Puts the next observations whose tracks are first .. last - 1 into a block, up to ``stop``; returns where it went on to. */
+static int64_t rows_of_tracks(const model_t *model, const int32_t *track_of_row, int64_t from, int64_t stop, int64_t first,
+                              int64_t last, block_t *b, int *count) {
+    *count = 0;
+    for (; from < stop && *count < SIZE; ++from) {
+        b->rows[*count] = from;
+        *count += track_of_row[from] >= first && track_of_row[from] < last;
+        if (from + 2 * SIZE < stop) ask_ahead(model, from + 2 * SIZE);
+    }
+    b->in_a_row = *count == SIZE && b->rows[SIZE - 1] - b->rows[0] == SIZE - 1;
+    return from;
+}
+
 /* Second pass of images that share a camera: what each observation adds to its track, tracks first .. last - 1. */
-KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows, const double *on_y, const double *coefficients, const int64_t *track_of_point, int64_t first, int64_t last, double *per_track) {
+KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows, const double *on_y, const double *coefficients, const int32_t *track_of_row, int64_t first, int64_t last, double *per_track) {
     const model_t model = MODEL;
     const int q = own_columns(facts);
     void *to_free;
@@ -726,22 +750,19 @@ KERNEL int64_t sfm_misfit_tracks(WINDOW, const double *basis, int64_t basis_rows
     for (int64_t i = 0; i < num_images; ++i) {
         const image_t image = IMAGE(i);
         for (int64_t from = image.start; from < image.stop;) {
-            int count = 0;
-            for (; from < image.stop && count < SIZE; ++from) {
-                const int64_t track = track_of_point[point[from]];
-                b->rows[count] = from;
-                count += track >= first && track < last;
-            }
+            int count;
+            double *track[SIZE];
+            from = rows_of_tracks(&model, track_of_row, from, image.stop, first, last, b, &count);
             if (!count) break;
-            b->in_a_row = 0;
+            for (int k = 0; k < count; ++k) {
+                track[k] = per_track + (track_of_row[b->rows[k]] - first) * NUM_FEATURES;
+                for (int j = 0; j < NUM_FEATURES; j += 8) SOON(track[k] + j);
+            }
             evaluate(&model, &image, count, b);
             weigh(b, q, basis + i * basis_rows * q, (int)basis_rows, on_y + i * q, &scratch->scores);
             fill_scores(b, q, &scratch->scores);
             project_scores(&scratch->scores, q, coefficients + i * q * NUM_FEATURES);
-            double *own[SIZE];
-            for (int k = 0; k < count; ++k) own[k] = per_track + (track_of_point[point[b->rows[k]]] - first) * NUM_FEATURES;
-            for (int j = 0; j < NUM_FEATURES; ++j)
-                for (int k = 0; k < count; ++k) own[k][j] += scratch->scores.g[q + j][k];
+            add_to_tracks((const row_t *)scratch->scores.g + q, count, track);
         }
     }
     free(to_free);
