@@ -253,7 +253,7 @@ class ObservationTable:
     """
 
     offsets: IntArray
-    point2d_idx: IntArray
+    point2d_idx: UInt32Array
     xy_px: FloatArray
     point_idx: IntArray
 

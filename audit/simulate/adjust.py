@@ -121,7 +121,7 @@ def sparse_model(scene: SimulatedScene, claim: Claim, location: str = "simulated
         ),
         observations=ObservationTable(
             scene.offsets,
-            np.arange(len(scene.point_idx), dtype=np.int64) - scene.offsets[scene.image_idx],
+            (np.arange(len(scene.point_idx)) - scene.offsets[scene.image_idx]).astype(np.uint32),
             scene.xy_px,
             scene.point_idx,
         ),

@@ -22,7 +22,7 @@ CAMERA_SENSOR: Final = 0
 IDENTITY_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Pose = tuple[float, ...]
 _MOST_AT_ONCE: Final = 1 << 21  # 2D points for which memory is asked; more are put together afterwards
-_Linked = tuple[IntArray, FloatArray, UInt64Array]
+_Linked = tuple[UInt32Array, FloatArray, UInt64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ class RawImages:
     poses: FloatArray
     num_points2d: IntArray
     offsets: IntArray
-    point2d_idx: IntArray
+    point2d_idx: UInt32Array
     xy_px: FloatArray
     point3d_id: UInt64Array
     num_unused_nonfinite: int = 0
@@ -118,7 +118,7 @@ class RawImage:
     camera_id: int
     name: str
     num_points2d: int
-    point2d_idx: IntArray
+    point2d_idx: UInt32Array
     xy_px: FloatArray
     point3d_id: UInt64Array
     num_unused_nonfinite: int = 0
@@ -177,7 +177,7 @@ class LinkedPoints:
 
 
 def _no_linked(capacity: int) -> _Linked:
-    return np.empty(capacity, np.int64), np.empty((capacity, 2)), np.empty(capacity, np.uint64)
+    return np.empty(capacity, np.uint32), np.empty((capacity, 2)), np.empty(capacity, np.uint64)
 
 
 def image_columns(images: Sequence[RawImage], linked: LinkedPoints | None = None) -> RawImages:
@@ -186,7 +186,7 @@ def image_columns(images: Sequence[RawImage], linked: LinkedPoints | None = None
     if linked is not None and all(row is image for row, image in zip(rows, images, strict=True)):
         point2d_idx, xy_px, point3d_id = linked.columns()
     else:
-        no_ids, no_xy, no_idx = np.empty(0, np.uint64), np.empty((0, 2)), np.empty(0, np.int64)
+        no_ids, no_xy, no_idx = np.empty(0, np.uint64), np.empty((0, 2)), np.empty(0, np.uint32)
         point2d_idx = np.concatenate([no_idx, *(row.point2d_idx for row in rows)])
         xy_px = np.concatenate([no_xy, *(row.xy_px for row in rows)])
         point3d_id = np.concatenate([no_ids, *(row.point3d_id for row in rows)])

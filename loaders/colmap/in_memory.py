@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.arrays import FloatArray, UInt32Array, UInt64Array
 from sfm_audit.loaders.assembly.raw import (
     CAMERA_SENSOR,
     IDENTITY_POSE,
@@ -103,20 +103,20 @@ def _image(image: Any) -> RawImage:
     return RawImage(image.image_id, pose, image.camera_id, image.name, image.num_points2D(), point2d_idx, xy_px, ids)
 
 
-def _linked(image: Any) -> tuple[IntArray, FloatArray, UInt64Array]:
+def _linked(image: Any) -> tuple[UInt32Array, FloatArray, UInt64Array]:
     """Positions (m,), coordinates (m, 2) and point ids (m,) of the linked 2D points."""
     layout, points2d = _layout(), image.points2D
     read = layout.read(points2d) if layout is not None and len(points2d) else None
     if read is None:
         return linked_one_by_one(image)
     xy_px, ids = read
-    linked = np.flatnonzero(ids != UNLINKED).astype(np.int64, copy=False)
+    linked = np.flatnonzero(ids != UNLINKED).astype(np.uint32)
     return linked, xy_px[linked], ids[linked]
 
 
-def linked_one_by_one(image: Any) -> tuple[IntArray, FloatArray, UInt64Array]:
+def linked_one_by_one(image: Any) -> tuple[UInt32Array, FloatArray, UInt64Array]:
     """Return the same as arrays are read, by way of one Python object per linked 2D point."""
-    linked = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+    linked = np.array(image.get_observation_point2D_idxs(), dtype=np.uint32)
     points2d = image.get_observation_points2D()
     xy_px = np.array([point.xy for point in points2d], dtype=np.float64).reshape(-1, 2)
     return linked, xy_px, np.fromiter((point.point3D_id for point in points2d), np.uint64, len(points2d))

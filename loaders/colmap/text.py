@@ -156,7 +156,7 @@ def _read_image(file: TextFile, line: int, header: bytes, points2d_line: int, po
     values = parse_floats(file, points2d_line, fields, what).reshape(-1, 3)
     ids = _point_ids(file, points2d_line, fields, values[:, 2])
     point2d_idx = np.flatnonzero(ids != UNLINKED)
-    linked = point2d_idx.astype(np.int64, copy=False)
+    linked = point2d_idx.astype(np.uint32)
     return RawImage(
         image_id,
         tuple(pose.tolist()),

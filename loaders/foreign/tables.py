@@ -118,7 +118,7 @@ def _image_table(images: Sequence[PlacedImage], links: Links, is_kept: BoolArray
         poses=np.array([image.pose for image in sorted_images], dtype=np.float64).reshape(-1, 7),
         num_points2d=counts + np.array([image.num_unlinked for image in sorted_images], dtype=np.int64),
         offsets=offsets,
-        point2d_idx=np.arange(len(kept), dtype=np.int64) - np.repeat(offsets[:-1], counts),
+        point2d_idx=(np.arange(len(kept)) - np.repeat(offsets[:-1], counts)).astype(np.uint32),
         xy_px=links.xy_px[kept[order]].reshape(-1, 2),
         point3d_id=links.point3d_id[kept[order]],
     )
