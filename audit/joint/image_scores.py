@@ -29,6 +29,9 @@ _ROLLING, _NEXT = _BOTH + 4, _BOTH + 10
 _LEFT_OF_TERMS: Final = 1e-4  # share of its functions' squared lengths that a field has at least: four digits may go
 _MISSING: Final = 6
 """Columns of the parameters that a camera may lack, behind the candidate fields: see `implied`."""
+SHIFT: Final = np.zeros((FIELDS, 2))
+"""(44, 2) of which functions a shift of the image is made."""
+SHIFT[_X, 0] = SHIFT[_Y, 1] = 1.0
 
 
 def sums_of_base(base: Base) -> JointSums | None:
@@ -88,18 +91,14 @@ class ScoresOfMany:
     """
 
     def __init__(self, system: JointSystem, base: Base, sums: JointSums) -> None:
-        observations, residuals, model = system.observations, system.residuals, system.model
+        observations = system.observations
         self._system, self._sums = system, sums
-        seen = SeenArrays(
-            *(model.points.xyz_world, model.observations.xy_px, residuals.residuals_px, residuals.observation_row),
-            *(observations.points, observations.source),
-        )
-        first = np.full(len(model.images), -1, dtype=np.int64)
+        first = np.full(len(system.model.images), -1, dtype=np.int64)
         for image, extra in base.included.items():
             first[image] = int(extra.columns[0]) - len(base.inverse.main) if extra.columns.size else 0
         included = IncludedArrays(base.inverse.update, base.inverse.border, base.inverse.corner, first)
         given = observations.layout.columns, observations.transform, base.inverse.main.arrays()
-        self._kernel = JointScores(sums, *given, included=included, seen=seen)
+        self._kernel = JointScores(sums, *given, included=included, seen=seen_by(system))
 
     def scores(self, images: Sequence[int], powers: Sequence[int]) -> list[CandidateScores | None]:
         """Return the scores of some images; None where `image_scores` has to be asked, or who comes after it.
@@ -116,8 +115,7 @@ class ScoresOfMany:
         chosen = np.array([images[k] for k in asked], dtype=np.int64)
         power = np.array([powers[k] for k in asked], dtype=np.int64)
         of_asked = [cameras[k] for k in asked]
-        fisheye = np.array([is_fisheye(camera.model) for camera in of_asked], dtype=np.int64)
-        found = self._kernel.of(Asked(chosen, _facts(self._system, chosen, of_asked), fisheye, power))
+        found = self._kernel.of(asked_of(self._system, chosen, of_asked, power))
         if found is None:
             return out
         for k, each in zip(asked, self._told(chosen, power, _fields_of(of_asked), found), strict=True):
@@ -156,6 +154,26 @@ class ScoresOfMany:
 def scores_of_many(system: JointSystem, base: Base, sums: JointSums | None) -> ScoresOfMany | None:
     """Return who asks about many images at once; None where each has to be asked by itself."""
     return ScoresOfMany(system, base, sums) if sums is not None and sums.repeats_follow else None
+
+
+def seen_by(system: JointSystem) -> SeenArrays:
+    """Return where the points of a system, and what was observed, are found."""
+    observations, residuals, model = system.observations, system.residuals, system.model
+    return SeenArrays(
+        *(model.points.xyz_world, model.observations.xy_px, residuals.residuals_px, residuals.observation_row),
+        *(observations.points, observations.source),
+    )
+
+
+def asked_of(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord], power: IntArray) -> Asked:
+    """Return what the kernels ask about images: their facts, which are fisheyes, the power of the next radial term."""
+    fisheye = np.array([is_fisheye(camera.model) for camera in cameras], dtype=np.int64)
+    return Asked(images, _facts(system, images, cameras), fisheye, power)
+
+
+def missing_of(camera: CameraRecord) -> FloatArray:
+    """(44, 6) of which functions the columns of the missing parameters are made (`implied`)."""
+    return np.asarray(_fields_of([camera])[0, :, NUM_FIELDS:])
 
 
 def _facts(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord]) -> FloatArray:

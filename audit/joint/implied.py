@@ -15,10 +15,10 @@ from sfm_audit.audit.cameras.functions import Term
 from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
+from sfm_audit.audit.joint.common_scores import common_scores
 from sfm_audit.audit.joint.own import CameraStep
-from sfm_audit.audit.joint.shift_scores import shift_scores
 from sfm_audit.audit.joint.system import JointSystem
-from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
+from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord
@@ -220,11 +220,13 @@ def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]
 
 def _of_images(system: JointSystem, asked: _Asked) -> list[ImpliedParameter]:
     images = asked.images[np.diff(system.observations.offsets)[asked.images] > 0]
-    if asked.camera_idx is None:
-        compiled = shift_scores(system.base, images)
-        if compiled is not None:
-            return _implied(system, asked._replace(images=images), compiled)
-    columns = _missing_fields if asked.camera_idx is not None else _shift_fields
+    is_camera = asked.camera_idx is not None
+    compiled = None
+    if not is_camera or follows_the_lens(asked.camera.model):
+        compiled = common_scores(system, images, asked.camera if is_camera else None, next_power(asked.camera))
+    if compiled is not None:
+        return _implied(system, asked._replace(images=images), compiled)
+    columns = _missing_fields if is_camera else _shift_fields
 
     def fields_of(image: int) -> FieldsInParts:
         return FieldsInParts(partial(columns, system, image))

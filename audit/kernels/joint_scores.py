@@ -108,7 +108,7 @@ class _Inverse(ctypes.Structure):
 
 
 class _Seen(ctypes.Structure):
-    """`seen_points` of joint_scores.c."""
+    """`seen_points` of joint.h."""
 
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("xyz", "observed", "residuals", "points", "source", "observation_row")),
@@ -144,7 +144,7 @@ class JointScores:
         else:
             self._inverse.dense = self._kept(doubles(inverse, (size, size)))
         self._take_included(included, size)
-        self._seen = self._checked(seen)
+        self._seen = seen_points(seen, sums, self._held)
         self._inverse.held = self._seen.held = self._held  # whoever keeps the addresses keeps the arrays
 
     def _kept(self, array: npt.NDArray[Any]) -> int:
@@ -196,24 +196,6 @@ class JointScores:
         self._inverse.corner = self._kept(doubles(included.corner, (num_extra, num_extra)))
         self._inverse.extra_column = self._kept(first)
 
-    def _checked(self, seen: SeenArrays) -> _Seen:
-        num = seen.observation_row.size
-        row = small_ints(seen.observation_row, num)
-        points, source = ints(seen.points, self._sums.num_points), ints(seen.source, self._sums.num_rows)
-        for name, index, limit in (
-            ("observation_row", row, len(seen.xy_px)),
-            ("points", points, len(seen.xyz_world)),
-            ("source", source, num),
-        ):
-            if index.size and not (index.min() >= 0 and index.max() < limit):
-                raise ValueError(f"{name}: expected 0 .. {limit - 1}, found {index.min()} .. {index.max()}")
-        given = (
-            doubles(seen.xyz_world, (len(seen.xyz_world), 3)),
-            doubles(seen.xy_px, (len(seen.xy_px), 2)),
-            doubles(seen.residuals_px, (2, num)),
-        )
-        return _Seen(*(self._kept(array) for array in (*given, points, source, row)), num)
-
     def of(self, asked: Asked) -> Scores | None:
         """Return what the tests of some images need; None without kernels."""
         function = kernel(
@@ -232,6 +214,28 @@ class JointScores:
         model = (ctypes.byref(each) for each in (self._sums.model, self._inverse, self._seen))
         done = function(*model, k, *given, *self._sums.most_of(images), status, *found)
         return Scores(status == DONE, *found) if done == DONE else None
+
+
+def seen_points(seen: SeenArrays, sums: JointSums, held: list[object]) -> ctypes.Structure:
+    """Return `seen_points` of joint.h for a model; ``held`` gets the arrays that it points to."""
+    num = seen.observation_row.size
+    row = small_ints(seen.observation_row, num)
+    points, source = ints(seen.points, sums.num_points), ints(seen.source, sums.num_rows)
+    for name, index, limit in (
+        ("observation_row", row, len(seen.xy_px)),
+        ("points", points, len(seen.xyz_world)),
+        ("source", source, num),
+    ):
+        if index.size and not (index.min() >= 0 and index.max() < limit):
+            raise ValueError(f"{name}: expected 0 .. {limit - 1}, found {index.min()} .. {index.max()}")
+    given = (
+        doubles(seen.xyz_world, (len(seen.xyz_world), 3)),
+        doubles(seen.xy_px, (len(seen.xy_px), 2)),
+        doubles(seen.residuals_px, (2, num)),
+    )
+    arrays = *given, points, source, row
+    held += arrays
+    return _Seen(*(array.ctypes.data for array in arrays), num)
 
 
 _OUT: Final = (Ints, Ints, *([Doubles] * 7))

@@ -14,15 +14,16 @@ from numpy.testing import assert_allclose
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.joint import audit_jointly, misfit
+from sfm_audit.audit.joint import common_scores as common_score_module
 from sfm_audit.audit.joint.candidates import FieldsInParts, candidate_scores
+from sfm_audit.audit.joint.common_scores import common_scores
 from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.image_scores import image_scores, scores_of_many, sums_of_base
-from sfm_audit.audit.joint.implied import ImpliedBeside, _shift_fields
+from sfm_audit.audit.joint.implied import ImpliedBeside, _missing_fields, _shift_fields, next_power
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 from sfm_audit.audit.joint.observations import joint_observations
 from sfm_audit.audit.joint.own import own_parameters
-from sfm_audit.audit.joint.shift_scores import shift_scores
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.joint import JointArrays, JointSums
@@ -188,20 +189,28 @@ def test_beside_included_fields_too(both):
     for image in range(len(both.model.images)):
         found, expected = by_both(both, base, image, beside)
         same_scores(found, expected)
-    assert shift_scores(base, np.arange(len(both.model.images))) is None
+    with_included = dataclasses.replace(system, base=base)
+    everybody = np.arange(len(both.model.images))
+    assert (common_scores(with_included, everybody, None, 1) is None) == bool(base.included)
 
 
 @pytest.mark.parametrize("images", [[0, 1, 2, 3, 4, 5, 6], [1, 2, 4]])
-def test_a_shift_of_many_images_has_the_same_scores(both, images):
-    found = shift_scores(both.plain.base, np.array(images))
+@pytest.mark.parametrize("columns", [_shift_fields, _missing_fields])
+def test_what_many_images_have_in_common_has_the_same_scores(both, images, columns):
+    system, camera = both.plain, None
+    if columns is _missing_fields:
+        if both.name == "FULL_OPENCV":
+            return  # does not follow its lens: never asked
+        camera = both.model.image(images[0]).camera
+        images = images if len(both.model.cameras) == 1 else images[:1]
+    power = next_power(both.model.camera(0))
+    found = common_scores(system, np.array(images), camera, power)
     with numpy_only():
-        expected = candidate_scores(
-            both.plain.base, images, lambda image: FieldsInParts(partial(_shift_fields, both.plain, image))
-        )
-        assert shift_scores(both.plain.base, np.array(images)) is None
+        expected = candidate_scores(system.base, images, lambda image: FieldsInParts(partial(columns, system, image)))
+        assert common_scores(system, np.array(images), camera, power) is None
     place = np.searchsorted(found.support, expected.support)
     outside = np.setdiff1d(found.support, expected.support)
-    assert not np.any(found.coupling[outside])
+    assert np.abs(found.coupling[outside]).max(initial=0.0) <= 1e-12 * np.abs(found.coupling).max()
     of_found = dataclasses.replace(
         found,
         basis_coupling=found.basis_coupling[place],
@@ -211,8 +220,9 @@ def test_a_shift_of_many_images_has_the_same_scores(both, images):
     same_scores(of_found, expected, 1e-6 if both.name == "FULL_OPENCV" else TOLERANCE)
 
 
-def test_few_images_are_gone_through_alone(both):
-    assert shift_scores(both.plain.base, np.array([1])) is None
+def test_few_images_are_gone_through_alone(both, monkeypatch):
+    monkeypatch.setattr(common_score_module, "_MIN_SHARE", 0.5)
+    assert common_scores(both.plain, np.array([1]), None, 1) is None
 
 
 def test_verdicts_are_the_same(both):

@@ -1,4 +1,4 @@
-/* What joint.c and joint_scores.c share: the model of the joint system. */
+/* What joint.c, joint_scores.c and joint_common.c share: the model of the joint system. */
 #ifndef SFM_AUDIT_JOINT_H
 #define SFM_AUDIT_JOINT_H
 
@@ -27,6 +27,17 @@ typedef struct {
     const int64_t *extra_width;  /* (I) */
     const double *extra;         /* per image (n_i, 2, r) */
 } joint_model;
+
+/* Where the points, and what was observed, are found. */
+typedef struct {
+    const double *xyz, *observed, *residuals; /* (.., 3), (.., 2), (2, num_residuals) */
+    const int64_t *points, *source;           /* (P) rows of xyz, (n) columns of residuals */
+    const int32_t *observation_row;           /* (num_residuals) rows of observed */
+    int64_t num_residuals;
+} seen_points;
+
+/* joint_scores.c */
+void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted);
 
 /* joint.c */
 int64_t joint_first(

@@ -20,14 +20,6 @@ typedef struct {
     const int64_t *extra_column; /* (I) first of an image's included fields in the border */
 } base_inverse;
 
-/* Where the points, and what was observed, are found. */
-typedef struct {
-    const double *xyz, *observed, *residuals; /* (.., 3), (.., 2), (2, num_residuals) */
-    const int64_t *points, *source;           /* (P) rows of xyz, (n) columns of residuals */
-    const int32_t *observation_row;           /* (num_residuals) rows of observed */
-    int64_t num_residuals;
-} seen_points;
-
 typedef struct {
     int64_t key, row, column;
 } keyed;
@@ -148,19 +140,38 @@ static inline __attribute__((always_inline)) void add_included(
     }
 }
 
-/* out (FIELDS, FIELDS) += sign times left^T right, both (num, FIELDS). */
+/* The last `num` vectors of row a of out (FIELDS, FIELDS) += sign times left^T right, rows first <= t < last. */
+INLINE void add_row_of_products(
+    int num, int64_t first, int64_t last, int64_t a, const double *left, const double *right, double sign, double *out) {
+    wide sum[VECTORS] = {{0}}, by = {sign, sign, sign, sign};
+    const double *from = right + FIELDS - LANES * num;
+    double *to = out + FIELDS * (a + 1) - LANES * num;
+    for (int64_t t = first; t < last; t++) {
+        double x = left[FIELDS * t + a];
+        wide f = {x, x, x, x};
+        for (int v = 0; v < num; v++) sum[v] += f * LOAD(from + FIELDS * t + LANES * v);
+    }
+    for (int v = 0; v < num; v++) STORE(to + LANES * v) += by * sum[v];
+}
+
+/* out (FIELDS, FIELDS) += sign times left^T right, both (num, FIELDS), at and right of the diagonal: it is symmetric. */
 INLINE void add_products(int64_t num, const double *left, const double *right, double sign, double *out) {
     for (int64_t first = 0; first < num; first += TRACKS_AT_ONCE) {
         int64_t last = first + TRACKS_AT_ONCE < num ? first + TRACKS_AT_ONCE : num;
         for (int64_t a = 0; a < FIELDS; a++) {
-            wide sum[VECTORS] = {{0}};
-            for (int64_t t = first; t < last; t++) {
-                double x = left[FIELDS * t + a];
-                wide f = {x, x, x, x};
-                for (int v = 0; v < VECTORS; v++) sum[v] += f * LOAD(right + FIELDS * t + LANES * v);
+            switch (VECTORS - a / LANES) { /* so that the sums stay in registers */
+            case 11: add_row_of_products(11, first, last, a, left, right, sign, out); break;
+            case 10: add_row_of_products(10, first, last, a, left, right, sign, out); break;
+            case 9: add_row_of_products(9, first, last, a, left, right, sign, out); break;
+            case 8: add_row_of_products(8, first, last, a, left, right, sign, out); break;
+            case 7: add_row_of_products(7, first, last, a, left, right, sign, out); break;
+            case 6: add_row_of_products(6, first, last, a, left, right, sign, out); break;
+            case 5: add_row_of_products(5, first, last, a, left, right, sign, out); break;
+            case 4: add_row_of_products(4, first, last, a, left, right, sign, out); break;
+            case 3: add_row_of_products(3, first, last, a, left, right, sign, out); break;
+            case 2: add_row_of_products(2, first, last, a, left, right, sign, out); break;
+            default: add_row_of_products(1, first, last, a, left, right, sign, out); break;
             }
-            wide by = {sign, sign, sign, sign};
-            for (int v = 0; v < VECTORS; v++) STORE(out + FIELDS * a + LANES * v) += by * sum[v];
         }
     }
 }
@@ -276,7 +287,7 @@ INLINE void spread_columns(const joint_model *m, const base_inverse *s, const wo
 }
 
 /* The rows of an image's points: xyz (n, 3), predicted (n, 2). */
-static void look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted) {
+void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted) {
     for (int64_t i = 0; i < n; i++) {
         int64_t source = p->source[first + i];
         const double *from = p->xyz + 3 * p->points[m->point_idx[first + i]], *xy = p->observed + 2 * p->observation_row[source];
@@ -307,7 +318,7 @@ WIDE KERNEL int64_t joint_scores(
     for (int64_t k = 0; k < num; k++) {
         int64_t image = images[k], first = m->offsets[image], n = m->offsets[image + 1] - first, found[2];
         double *g = gram + k * FIELDS * FIELDS, *v = meat + k * FIELDS * FIELDS;
-        look_up(m, p, first, n, w.xyz, w.predicted);
+        joint_look_up(m, p, first, n, w.xyz, w.predicted);
         status[k] = joint_fields(m, image, facts + 27 * k, w.xyz, w.predicted, is_fisheye[k], power[k], w.scalar, w.dense);
         if (status[k] != DONE) continue;
         num_tracks[k] = number_tracks(m, first, n, w.track);
@@ -327,11 +338,11 @@ WIDE KERNEL int64_t joint_scores(
         spread_columns(m, s, &w, found[0], found[1]);
         joint_second(m, found[0], w.own, w.around, w.start, w.track, w.scores, w.moved, w.track_score);
         add_products(count[0] + count[1], w.ordered, w.solution, -1.0, g);
-        for (int64_t a = 0; a < FIELDS; a++) {
-            for (int64_t b = 0; b < a; b++) g[FIELDS * a + b] = g[FIELDS * b + a] = 0.5 * (g[FIELDS * a + b] + g[FIELDS * b + a]);
-        }
         memset(v, 0, FIELDS * FIELDS * sizeof *v);
         add_products(num_tracks[k], w.track_score, w.track_score, 1.0, v);
+        for (int64_t a = 0; a < FIELDS; a++) {
+            for (int64_t b = 0; b < a; b++) g[FIELDS * a + b] = g[FIELDS * b + a], v[FIELDS * a + b] = v[FIELDS * b + a];
+        }
         for (int64_t j = 0, row = 0; j < found[0]; row += width + m->extra_width[w.around[j]], j++) {
             for (int64_t c = 0; w.around[j] == image && c < width; c++) {
                 int64_t from = w.position[row + c], at = (k * width + c) * FIELDS;
