@@ -46,7 +46,10 @@ def common_scores(
         nothing = np.zeros(0, dtype=np.int64)
         asked, made_of = Asked(images, np.zeros((0, 27)), nothing, nothing), SHIFT
     else:
-        asked, made_of = asked_of(system, images, [camera] * images.size, np.full(images.size, power)), missing_of(camera)
+        asked, made_of = (
+            asked_of(system, images, [camera] * images.size, np.full(images.size, power)),
+            missing_of(camera),
+        )
     fields = CommonFields(sums, seen_by(system), asked, made_of)
     found = fields.gram()
     along = None if found is None else fields.right(found.absorbed)

@@ -14,7 +14,7 @@ from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, po
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.kernels.joint import JointSums
-from sfm_audit.audit.kernels.joint_parts import two_informations, unit_determinants
+from sfm_audit.audit.kernels.joint_parts import symmetric_of_blocks, two_informations, unit_determinants
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
@@ -107,31 +107,14 @@ def _of_images(observations: JointObservations, compiled: Callable[[int], T | No
 
 def _symmetric(num_columns: int, rows: IntArray, columns: IntArray, blocks: FloatArray) -> sparse.csr_array:
     """(D, D) A + A^T of blocks (m, r, c) of A at rows (m, r) and columns (m, c); D is padding."""
-    width = blocks.shape[1]
-    steps = np.arange(width)
-    apart = not num_columns % width and np.array_equal(rows, rows[:, :1] + steps) and not (rows[:, 0] % width).any()
-    if apart and np.array_equal(columns, columns[:, :1] + steps) and not (columns[:, 0] % width).any():
-        row, column = rows[:, 0] // width, columns[:, 0] // width
-        if int(max(row.max(), column.max())) * width < num_columns:
-            return _of_blocks(num_columns // width, row, column, blocks)
+    compiled = symmetric_of_blocks(num_columns, rows, columns, blocks)
+    if compiled is not None:
+        return sparse.csr_array(compiled, shape=(num_columns, num_columns))
     row = np.broadcast_to(rows.astype(np.int32)[:, :, None], blocks.shape).ravel()
     column = np.broadcast_to(columns.astype(np.int32)[:, None, :], blocks.shape).ravel()
     size = num_columns + 1
     half = sparse.coo_array((blocks.ravel(), (row, column)), shape=(size, size)).tocsr()
     return sparse.csr_array((half + half.T)[:num_columns, :num_columns])
-
-
-def _of_blocks(num_blocks: int, row: IntArray, column: IntArray, blocks: FloatArray) -> sparse.csr_array:
-    """The same where every image has columns of its own, one after the other: each pair of images has one block."""
-    diagonal = row == column
-    both = np.concatenate([blocks, blocks[~diagonal].swapaxes(1, 2)])
-    both[np.flatnonzero(diagonal)] += blocks[diagonal].swapaxes(1, 2)
-    rows, columns = np.concatenate([row, column[~diagonal]]), np.concatenate([column, row[~diagonal]])
-    order = np.argsort(rows * num_blocks + columns, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=num_blocks))])
-    size, width = num_blocks * blocks.shape[1], blocks.shape[1]
-    matrix = sparse.bsr_array((both[order], columns[order], starts), shape=(size, size), blocksize=(width, width))
-    return sparse.csr_array(matrix.tocsr())
 
 
 def _eliminate_points(

@@ -95,7 +95,11 @@ class CommonFields:
         padded[:, :, : self._num_fields] = moved
         out = np.empty((num_points, COMMON))
         given = num_points, self._is_own, *self._fields, padded
-        return out[:, : self._num_fields] if function is not None and function(*self._model(), *given, out) == DONE else None
+        return (
+            out[:, : self._num_fields]
+            if function is not None and function(*self._model(), *given, out) == DONE
+            else None
+        )
 
 
 _MODEL: Final = (ctypes.c_void_p, ctypes.c_void_p)

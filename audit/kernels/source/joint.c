@@ -76,14 +76,14 @@ typedef struct {
     double x[MOST_COLUMNS], y[MOST_COLUMNS];
 } pair_of_rows;
 
-static inline __attribute__((always_inline)) void take_rows(
+INLINE void take_rows(
     const double *x, const double *y, int64_t count, pair_of_rows *out) {
     for (int64_t c = 0; c < count; c++) out->x[c] = x[c], out->y[c] = y[c];
 }
 
 /* out (num, 2, ROWS): w J^T times chosen columns of the rows, through A (3, 2) of the own observation.
  * scores (num, width): w rows^T y~. */
-static inline __attribute__((always_inline)) void crossed(
+INLINE void crossed(
     const joint_model *m, const int32_t *view, const int32_t *own, int64_t num, row_block block, int64_t column,
     const double *absorbing, double *out, double *scores) {
     int64_t count = block.width - column < ROWS ? block.width - column : ROWS;
@@ -108,7 +108,7 @@ static inline __attribute__((always_inline)) void crossed(
 
 /* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. Scalars for one
  * row after the other, dense fields for four rows at a time: as many sums as there are registers. */
-static inline __attribute__((always_inline)) void subtract_fields(
+INLINE void subtract_fields(
     const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
     double *out) {
     for (int64_t c = 0; c < count; c++) {
@@ -152,7 +152,7 @@ typedef struct {
     double xd[SCALAR][DENSE], yd[SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE][DENSE];
 } own_gram;
 
-static inline __attribute__((always_inline)) void add_gram(
+INLINE void add_gram(
     own_gram *g, const double *f, const double *d, double w, double pxx, double pxy, double pyy) {
     double dx[DENSE], dy[DENSE], moment[MOMENTS] = {0.0};
     for (int j = 0; j < SCALAR - 1; j++) moment[j] = f[j];
@@ -208,7 +208,7 @@ static void spread_gram(const own_gram *g, double *gram, double *plain, double *
 }
 
 /* (FIELDS) vector E^T v of one observation, v (2). */
-static inline __attribute__((always_inline)) void add_along(double *out, const double *f, const double *d, double x, double y) {
+INLINE void add_along(double *out, const double *f, const double *d, double x, double y) {
     for (int i = 0; i < SCALAR; i++) out[i] += f[i] * x, out[SCALAR + i] += f[i] * y;
     for (int i = 0; i < DENSE; i++) out[2 * SCALAR + i] += d[i] * x + d[DENSE + i] * y;
 }
@@ -373,7 +373,7 @@ WIDE KERNEL int64_t joint_second(
  *
  * slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the design
  * without T).    more_slab: what the second system has more: of points whose weights differ, all others say the same twice. */
-static inline __attribute__((always_inline)) void add_slab(
+INLINE void add_slab(
     const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
     const double *other_absorbed, const unsigned char *differs, double *slab, double *more_slab) {
     int64_t width = m->width;
@@ -413,37 +413,55 @@ static inline __attribute__((always_inline)) void add_slab(
     }
 }
 
-/* N (n, 2, width) = design T of an image's rows. T comes first: products of columns that all but cancel in it (the depth of what a
- * long lens sees) would lose twice the digits. */
-static void take_nuisance(const joint_model *m, int64_t first, int64_t n, const double *transform, double *out) {
-    int64_t width = m->width, from[MOST_COLUMNS], until[MOST_COLUMNS]; /* T is the identity but for a few small blocks */
-    for (int64_t d = 0; d < width; d++) {
-        from[d] = width, until[d] = 0;
-        for (int64_t c = width - 1; c >= 0; c--) {
-            if (transform[c * width + d] != 0.0) from[d] = c, until[d] = until[d] ? until[d] : c + 1;
-        }
+/* N (n, 2, padded) = design T of an image's rows, zeros behind the last column. T comes first: products of columns that all but
+ * cancel in it (the depth of what a long lens sees) would lose twice the digits. */
+INLINE void turn_rows(
+    const joint_model *m, int64_t padded, int64_t first, int64_t n, const double *transform, double *out) {
+    double turn[MOST_COLUMNS * MOST_COLUMNS] = {0.0};
+    int64_t width = m->width;
+    for (int64_t c = 0; c < width; c++) {
+        for (int64_t d = 0; d < width; d++) turn[c * padded + d] = transform[c * width + d];
     }
     for (int64_t row = 0; row < 2 * n; row++) {
         const double *given = m->design + (2 * first + row) * width;
-        double *to = out + row * width;
-        for (int64_t d = 0; d < width; d++) {
-            double sum = 0.0;
-            for (int64_t c = from[d]; c < until[d]; c++) sum += given[c] * transform[c * width + d];
-            to[d] = sum;
+        wide sum[MOST_COLUMNS / LANES] = {{0}};
+        for (int64_t c = 0; c < width; c++) {
+            for (int64_t d = 0; d < padded; d += LANES) sum[d / LANES] += given[c] * LOAD(turn + c * padded + d);
+        }
+        for (int64_t d = 0; d < padded; d += LANES) STORE(out + row * padded + d) = sum[d / LANES];
+    }
+}
+
+/* V^-1 W^T (3, padded) of a row; nuisance (2, padded): its N. */
+INLINE void absorb_row(
+    const joint_model *m, int64_t row, const double *nuisance, int64_t padded, const double *weight, const double *inverse,
+    double *out) {
+    const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width, *v = inverse + 9 * m->point_idx[row];
+    for (int i = 0; i < 3; i++) {
+        double x = weight[row] * (v[3 * i] * jx[0] + v[3 * i + 1] * jx[1] + v[3 * i + 2] * jx[2]);
+        double y = weight[row] * (v[3 * i] * jy[0] + v[3 * i + 1] * jy[1] + v[3 * i + 2] * jy[2]);
+        for (int64_t d = 0; d < padded; d += LANES) {
+            STORE(out + i * padded + d) = x * LOAD(nuisance + d) + y * LOAD(nuisance + padded + d);
         }
     }
 }
 
-/* V^-1 W^T (3, padded) of a row; nuisance (2, width): its N. */
-static inline void absorb_row(
-    const joint_model *m, int64_t row, const double *nuisance, int64_t padded, const double *weight, const double *inverse,
-    double *out) {
-    const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width, *v = inverse + 9 * m->point_idx[row];
-    const double *nx = nuisance, *ny = nuisance + m->width;
-    for (int i = 0; i < 3; i++) {
-        double x = weight[row] * (v[3 * i] * jx[0] + v[3 * i + 1] * jx[1] + v[3 * i + 2] * jx[2]);
-        double y = weight[row] * (v[3 * i] * jy[0] + v[3 * i + 1] * jy[1] + v[3 * i + 2] * jy[2]);
-        for (int64_t d = 0; d < padded; d++) out[i * padded + d] = d < m->width ? x * nx[d] + y * ny[d] : 0.0;
+/* V^-1 W^T of all rows of an image, of both systems; differs (n): whether they do. */
+INLINE void absorb_rows(
+    const joint_model *m, int64_t first, int64_t n, int64_t padded, const double *nuisance, double *absorbed, double *other,
+    unsigned char *differs) {
+    for (int64_t i = 0; i < n; i++) {
+        if (i + AHEAD < n) {
+            int64_t point = m->point_idx[first + i + AHEAD];
+            SOON(m->point_inverse + 9 * point), SOON(m->point_inverse + 9 * point + 8);
+            SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
+        }
+        const double *mine = nuisance + 2 * padded * i;
+        int64_t point = m->point_idx[first + i];
+        /* of a point whose weights are the same, the inverses are, to the last bit */
+        differs[i] = memcmp(m->point_inverse + 9 * point, m->other_inverse + 9 * point, 9 * sizeof(double)) != 0;
+        absorb_row(m, first + i, mine, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
+        if (differs[i]) absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
     }
 }
 
@@ -454,21 +472,61 @@ static void trim(const double *from, int64_t padded, int64_t width, double scale
     }
 }
 
-/* gram (width, width) = N^T w N, right (width) = N^T w cleaned, of an image's own rows. */
-static inline __attribute__((always_inline)) void add_own(
-    int64_t width, int64_t first, int64_t n, const double *nuisance, const double *weight, const double *cleaned, double *gram,
-    double *right) {
-    memset(gram, 0, (size_t)(width * width) * sizeof *gram);
-    memset(right, 0, (size_t)width * sizeof *right);
-    for (int64_t i = 0; i < n; i++) {
-        const double *nx = nuisance + i * 2 * width, *ny = nx + width;
-        double w = weight[first + i], x = w * cleaned[2 * (first + i)], y = w * cleaned[2 * (first + i) + 1];
-        for (int64_t c = 0; c < width; c++) {
-            double wx = w * nx[c], wy = w * ny[c];
-            right[c] += nx[c] * x + ny[c] * y;
-            for (int64_t d = 0; d < width; d++) gram[c * width + d] += wx * nx[d] + wy * ny[d];
+/* gram (padded, padded) += scale N^T N of a row, at and right of the diagonal. */
+INLINE void add_row_gram(int64_t padded, const double *nuisance, double scale, double *gram) {
+    for (int64_t c = 0; c < padded; c++) {
+        double x = scale * nuisance[c], y = scale * nuisance[padded + c];
+        for (int64_t d = c / LANES * LANES; d < padded; d += LANES) {
+            STORE(gram + c * padded + d) += x * LOAD(nuisance + d) + y * LOAD(nuisance + padded + d);
         }
     }
+}
+
+/* Of an image's own rows and both systems: grams (2, width, width) N^T w N, rights (2, width) N^T w cleaned. */
+INLINE void add_own(
+    const joint_model *m, int64_t first, int64_t n, int64_t padded, const double *nuisance, const double *const cleaned[2],
+    double *grams, double *rights) {
+    double gram[2][MOST_COLUMNS * MOST_COLUMNS] = {{0.0}}, right[2][MOST_COLUMNS] = {{0.0}};
+    int64_t width = m->width;
+    for (int64_t i = 0; i < n; i++) {
+        const double *own = nuisance + i * 2 * padded;
+        double w[2] = {m->weight[first + i], m->other_weight[first + i]};
+        add_row_gram(padded, own, w[0], gram[0]);
+        if (w[1] != w[0]) add_row_gram(padded, own, w[1] - w[0], gram[1]); /* what the second system has more */
+        for (int k = 0; k < 2; k++) {
+            double x = w[k] * cleaned[k][2 * (first + i)], y = w[k] * cleaned[k][2 * (first + i) + 1];
+            for (int64_t d = 0; d < padded; d += LANES) {
+                STORE(right[k] + d) += x * LOAD(own + d) + y * LOAD(own + padded + d);
+            }
+        }
+    }
+    for (int64_t c = 0; c < width; c++) {
+        for (int64_t d = c; d < width; d++) {
+            double value = gram[0][c * padded + d], more = gram[1][c * padded + d];
+            grams[c * width + d] = grams[d * width + c] = value;
+            grams[(width + c) * width + d] = grams[(width + d) * width + c] = value + more;
+        }
+        rights[c] = right[0][c], rights[width + c] = right[1][c];
+    }
+}
+
+/* joint_normal once the views are known; `padded` is the width, rounded up to LANES. */
+INLINE void normal_of(
+    const joint_model *m, int64_t image, int64_t padded, const surroundings *near, const double *transform,
+    const double *const cleaned[2], double *nuisance, double *absorbed, double *other, unsigned char *differs, double *slab,
+    double *other_slab, double *grams, double *rights) {
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width, size = padded * padded;
+    turn_rows(m, padded, first, n, transform, nuisance);
+    absorb_rows(m, first, n, padded, nuisance, absorbed, other, differs);
+    for (int64_t k = 0; k < near->num_images; k++) {
+        double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
+        memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
+        add_slab(m, padded, near, k, absorbed, other, differs, here[0], here[1]);
+        for (int64_t c = 0; c < size; c++) here[1][c] += here[0][c];
+        trim(here[0], padded, width, scale, slab + k * width * width);
+        trim(here[1], padded, width, scale, other_slab + k * width * width);
+    }
+    add_own(m, first, n, padded, nuisance, cleaned, grams, rights);
 }
 
 /* What an image adds to the normal equations without the points, of both systems (reduced_systems of audit/joint/normal.py).
@@ -479,52 +537,64 @@ WIDE KERNEL int64_t joint_normal(
     const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *transform, const double *cleaned,
     const double *other_cleaned, int64_t *around, int64_t *num, double *slab, double *other_slab, double *grams,
     double *rights) {
-    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
-    int64_t padded = (width + LANES - 1) / LANES * LANES, size = padded * padded;
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
+    int64_t padded = (m->width + LANES - 1) / LANES * LANES;
     if (padded > MOST_COLUMNS) return NEEDS_NUMPY;
     int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
     int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
-    double *absorbed = malloc((size_t)(6 * padded * n + 1) * sizeof *absorbed), *other = absorbed + 3 * padded * n;
-    double *nuisance = malloc((size_t)(2 * width * n + 1) * sizeof *nuisance);
+    double *absorbed = malloc((size_t)(8 * padded * n + 1) * sizeof *absorbed);
+    double *other = absorbed + 3 * padded * n, *nuisance = other + 3 * padded * n;
     unsigned char *differs = malloc((size_t)n + 1);
-    int64_t status = view && start && own && absorbed && nuisance && differs ? DONE : NO_MEMORY;
+    int64_t status = view && start && own && absorbed && differs ? DONE : NO_MEMORY;
     if (status == DONE) {
+        const double *const both[2] = {cleaned, other_cleaned};
         surroundings near = {view, own, around, start, 0, 0};
         collect(m, first, first + n, image, place, &near);
-        take_nuisance(m, first, n, transform, nuisance);
-        for (int64_t i = 0; i < n; i++) {
-            if (i + AHEAD < n) {
-                int64_t point = m->point_idx[first + i + AHEAD];
-                SOON(m->point_inverse + 9 * point), SOON(m->point_inverse + 9 * point + 8);
-                SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
-            }
-            const double *mine = nuisance + 2 * width * i;
-            int64_t point = m->point_idx[first + i];
-            /* of a point whose weights are the same, the inverses are, to the last bit */
-            differs[i] = memcmp(m->point_inverse + 9 * point, m->other_inverse + 9 * point, 9 * sizeof(double)) != 0;
-            absorb_row(m, first + i, mine, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
-            if (differs[i]) absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
-        }
-        for (int64_t k = 0; k < near.num_images; k++) {
-            double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
-            memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
-            if (padded == 8) add_slab(m, 8, &near, k, absorbed, other, differs, here[0], here[1]);
-            else if (padded == 12) add_slab(m, 12, &near, k, absorbed, other, differs, here[0], here[1]);
-            else add_slab(m, padded, &near, k, absorbed, other, differs, here[0], here[1]);
-            for (int64_t c = 0; c < size; c++) here[1][c] += here[0][c];
-            trim(here[0], padded, width, scale, slab + k * width * width);
-            trim(here[1], padded, width, scale, other_slab + k * width * width);
-        }
         num[0] = near.num_images;
-        for (int which = 0; which < 2; which++) {
-            const double *weight = which ? m->other_weight : m->weight, *values = which ? other_cleaned : cleaned;
-            double *gram = grams + which * width * width, *right = rights + which * width;
-            if (width == 8) add_own(8, first, n, nuisance, weight, values, gram, right);
-            else add_own(width, first, n, nuisance, weight, values, gram, right);
+        if (padded == 8) {
+            normal_of(
+                m, image, 8, &near, transform, both, nuisance, absorbed, other, differs, slab, other_slab, grams, rights);
+        } else if (padded == 12) {
+            normal_of(
+                m, image, 12, &near, transform, both, nuisance, absorbed, other, differs, slab, other_slab, grams, rights);
+        } else {
+            normal_of(
+                m, image, padded, &near, transform, both, nuisance, absorbed, other, differs, slab, other_slab, grams, rights);
         }
     }
-    free(view), free(start), free(own), free(absorbed), free(nuisance), free(differs);
+    free(view), free(start), free(own), free(absorbed), free(differs);
     return status;
+}
+
+/* joint_meat once the views are known. */
+INLINE void meat_of(
+    const joint_model *m, int64_t image, int64_t padded, const surroundings *near, const double *transform, const int32_t *track,
+    double *nuisance, double *scores, double *slab) {
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
+    turn_rows(m, padded, first, n, transform, nuisance);
+    for (int64_t i = 0; i < n; i++) {
+        const double *own = nuisance + 2 * i * padded;
+        double x = m->weight[first + i] * m->left[2 * (first + i)], y = m->weight[first + i] * m->left[2 * (first + i) + 1];
+        double *to = scores + padded * (track[i] < 0 ? -1 - track[i] : track[i]);
+        for (int64_t d = 0; d < padded; d += LANES) STORE(to + d) += x * LOAD(own + d) + y * LOAD(own + padded + d);
+    }
+    for (int64_t k = 0; k < near->num_images; k++) {
+        double here[MOST_COLUMNS * MOST_COLUMNS];
+        memset(here, 0, (size_t)(padded * padded) * sizeof *here);
+        for (int64_t j = near->start[k]; j < near->start[k + 1]; j++) {
+            soon(m, near->view, j, near->start[k + 1]);
+            if (j + AHEAD < near->start[k + 1]) SOON(m->left + 2 * near->view[j + AHEAD]);
+            if (track[near->own[j]] < 0) continue;
+            int64_t row = near->view[j];
+            const double *dx = m->design + row * 2 * width, *dy = dx + width, *s = scores + padded * track[near->own[j]];
+            double w = m->weight[row], x = w * m->left[2 * row], y = w * m->left[2 * row + 1];
+            for (int64_t c = 0; c < width; c++) {
+                double value = dx[c] * x + dy[c] * y;
+                for (int64_t d = 0; d < padded; d += LANES) STORE(here + c * padded + d) += value * LOAD(s + d);
+            }
+        }
+        trim(here, padded, width, k ? 1.0 : 0.5, slab + k * width * width);
+    }
 }
 
 /* slab (m, width, width): sum over tracks of s_k s^T, s the sum of w y~ over an image's views of a track times N for the image
@@ -533,37 +603,20 @@ WIDE KERNEL int64_t joint_normal(
 WIDE KERNEL int64_t joint_meat(
     const joint_model *m, int64_t *place, int64_t image, int64_t capacity, const double *transform, const int32_t *track,
     int64_t num_tracks, int64_t *around, int64_t *num, double *slab) {
-    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
+    int64_t padded = (m->width + LANES - 1) / LANES * LANES;
+    if (padded > MOST_COLUMNS) return NEEDS_NUMPY;
     int64_t *start = malloc((size_t)(capacity + 1) * sizeof *start);
     int32_t *view = malloc((size_t)capacity * sizeof *view), *own = malloc((size_t)capacity * sizeof *own);
-    double *scores = calloc((size_t)(num_tracks * width + 1), sizeof *scores);
-    double *nuisance = malloc((size_t)(2 * width * n + 1) * sizeof *nuisance);
+    double *scores = calloc((size_t)(num_tracks * padded + 1), sizeof *scores);
+    double *nuisance = malloc((size_t)(2 * padded * n + 1) * sizeof *nuisance);
     int64_t status = view && start && own && scores && nuisance ? DONE : NO_MEMORY;
     if (status == DONE) {
         surroundings near = {view, own, around, start, 0, 0};
         collect(m, first, first + n, image, place, &near);
-        take_nuisance(m, first, n, transform, nuisance);
-        for (int64_t i = 0; i < n; i++) {
-            const double *dx = nuisance + 2 * i * width, *dy = dx + width;
-            double x = m->weight[first + i] * m->left[2 * (first + i)], y = m->weight[first + i] * m->left[2 * (first + i) + 1];
-            double *to = scores + width * (track[i] < 0 ? -1 - track[i] : track[i]);
-            for (int64_t c = 0; c < width; c++) to[c] += dx[c] * x + dy[c] * y;
-        }
-        memset(slab, 0, (size_t)(near.num_images * width * width) * sizeof *slab);
-        for (int64_t k = 0; k < near.num_images; k++) {
-            for (int64_t j = start[k]; j < start[k + 1]; j++) {
-                soon(m, view, j, start[k + 1]);
-                if (j + AHEAD < start[k + 1]) SOON(m->left + 2 * view[j + AHEAD]);
-                if (track[own[j]] < 0) continue;
-                const double *dx = m->design + view[j] * 2 * width, *dy = dx + width, *s = scores + width * track[own[j]];
-                double w = m->weight[view[j]], x = w * m->left[2 * view[j]], y = w * m->left[2 * view[j] + 1];
-                for (int64_t c = 0; c < width; c++) {
-                    double value = dx[c] * x + dy[c] * y, *to = slab + (k * width + c) * width;
-                    for (int64_t d = 0; d < width; d++) to[d] += value * s[d];
-                }
-            }
-        }
-        for (int64_t c = 0; near.num_images && c < width * width; c++) slab[c] *= 0.5;
+        if (padded == 8) meat_of(m, image, 8, &near, transform, track, nuisance, scores, slab);
+        else if (padded == 12) meat_of(m, image, 12, &near, transform, track, nuisance, scores, slab);
+        else meat_of(m, image, padded, &near, transform, track, nuisance, scores, slab);
         num[0] = near.num_images;
     }
     free(view), free(start), free(own), free(scores), free(nuisance);
