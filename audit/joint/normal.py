@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -10,10 +10,12 @@ import numpy as np
 from scipy import sparse
 
 from sfm_audit.audit.joint.design import AT_ONCE
+from sfm_audit.audit.joint.layout import Layout
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.kernels.joint import JointSums
+from sfm_audit.audit.kernels.joint_normal import PairBlocks, meats, normals
 from sfm_audit.audit.kernels.joint_parts import symmetric_of_blocks, two_informations, unit_determinants
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -70,39 +72,38 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
 def _compiled_systems(
     observations: JointObservations, sums: JointSums, inverses: list[FloatArray], values_px: FloatArray
 ) -> tuple[ReducedSystem, ReducedSystem] | None:
-    """The same by the compiled sums; the others' side of a block is without T, which comes to all of them here."""
+    """The same by the compiled sums."""
     layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
     cleaned = sums.off_points(values_px, 0)[1], sums.off_points(values_px, 1)[1]
-    found = _of_images(observations, lambda image: sums.normal(image, observations.transform[image], cleaned))
-    if not found or len(found) < images.size:
+    found = _of_images(observations, images, lambda some: normals(sums, some, observations.transform, cleaned))
+    if not found:
         return None
-    pairs = np.repeat(np.arange(images.size), [each.around.size for each in found])
-    around = np.concatenate([each.around for each in found])
-    own_columns = layout.columns[images]
+    own_columns, others, columns = _columns_of(layout, images, [each.pairs for each in found])
+    grams, rights = (np.concatenate([each[k] for each in found]) for k in (1, 2))
     systems = []
     for k, inverse in enumerate(inverses):
-        gram, score = np.stack([each.grams[k] for each in found]), np.stack([each.rights[k] for each in found])
         right, before = np.zeros((2, layout.num_columns + 1))
-        np.add.at(right, own_columns, score)
-        np.add.at(before, own_columns, np.einsum("iaa->ia", gram))
-        slabs = np.concatenate([each.slabs[k] for each in found])
-        slabs = observations.transform[around].transpose(0, 2, 1) @ slabs
-        first = np.flatnonzero(np.diff(pairs, prepend=-1))
-        slabs[first] += 0.5 * gram
-        matrix = _symmetric(layout.num_columns, layout.columns[around], own_columns[pairs], slabs)
+        np.add.at(right, own_columns, rights[:, k])
+        np.add.at(before, own_columns, np.einsum("iaa->ia", grams[:, k]))
+        slabs = np.concatenate([each.pairs.slabs[k] for each in found])
+        matrix = _symmetric(layout.num_columns, others, columns, slabs)
         systems.append(ReducedSystem(inverse, matrix, right[:-1], before[:-1]))
     return systems[0], systems[1]
 
 
-def _of_images(observations: JointObservations, compiled: Callable[[int], T | None]) -> list[T]:
-    """What a kernel says of the images with columns and observations, those of which it says nothing left out."""
-    images = observations.used_images
-
-    def some(start: int, stop: int) -> list[T]:
-        return [each for image in images[start:stop] if (each := compiled(image)) is not None]
-
+def _of_images(observations: JointObservations, images: IntArray, compiled: Callable[[IntArray], T | None]) -> list[T]:
+    """What a kernel says of ranges of images; nothing where it leaves one of them out."""
     counts = np.diff(observations.offsets)[images]
-    return [each for part in over_ranges(some, len(images), counts) for each in part]
+    parts = over_ranges(lambda start, stop: compiled(images[start:stop]), len(images), counts)
+    found = [part for part in parts if part is not None]
+    return found if len(found) == len(parts) else []
+
+
+def _columns_of(layout: Layout, images: IntArray, pairs: Sequence[PairBlocks]) -> tuple[IntArray, IntArray, IntArray]:
+    """Columns of the images (k, C), and of both images of each pair (m, C), first those of the rows."""
+    own = layout.columns[images]
+    counts = np.concatenate([each.counts for each in pairs])
+    return own, layout.columns[np.concatenate([each.around for each in pairs])], np.repeat(own, counts, axis=0)
 
 
 def _symmetric(num_columns: int, rows: IntArray, columns: IntArray, blocks: FloatArray) -> sparse.csr_array:
@@ -170,14 +171,12 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
 
 
 def _compiled_meat(observations: JointObservations, sums: JointSums) -> sparse.csr_array | None:
-    layout, transform, images = observations.layout, observations.transform, observations.used_images
-    found = _of_images(observations, lambda image: sums.meat(image, transform[image]))
-    if not found or len(found) < len(images):
+    layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
+    found = _of_images(observations, images, lambda some: meats(sums, some, observations.transform))
+    if not found:
         return None
-    own = np.repeat(images, [around.size for around, _ in found]).astype(np.int64)
-    around = np.concatenate([around for around, _ in found])
-    slabs = transform[around].transpose(0, 2, 1) @ np.concatenate([slab for _, slab in found])
-    return _symmetric(layout.num_columns, layout.columns[around], layout.columns[own], slabs)
+    slabs = np.concatenate([each.slabs[0] for each in found])
+    return _symmetric(layout.num_columns, *_columns_of(layout, images, found)[1:], slabs)
 
 
 def off_points(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -76,19 +77,6 @@ class _Space(NamedTuple):
     score: FloatArray
     track_score: FloatArray
     scores: FloatArray
-
-
-class NormalOfImage(NamedTuple):
-    """What an image adds to the normal equations.
-
-    around: (m,) the image and those behind it that see its points.    slabs: (2, m, C, C) between each of them (rows,
-    without T) and the image (columns, with T), its own one halved.    grams: (2, C, C), rights: (2, C), with T.
-    """
-
-    around: IntArray
-    slabs: FloatArray
-    grams: FloatArray
-    rights: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,6 +180,18 @@ class JointSums:
         most = min(views, self._num_images)
         columns = most * self.width + int(np.sort(self.extra_widths)[self._num_images - most :].sum())
         return int(counts.max(initial=0)), views, columns, self.width + int(self.extra_widths.max(initial=0))
+
+    def most_around(self, images: IntArray) -> int:
+        """Return how many images at most see points that one of some images sees."""
+        return int(np.minimum(self._num_views[images], self._num_images).max(initial=0))
+
+    @cached_property
+    def track_numbers(self) -> SmallIntArray:
+        """(n,) `tracks` of all images."""
+        offsets: IntArray = self._held["offsets"]
+        if self._is_first.all():
+            return (np.arange(offsets[-1]) - np.repeat(offsets[:-1], np.diff(offsets))).astype(np.int32)
+        return np.concatenate([self.tracks(image)[0] for image in range(self._num_images)])
 
     def can(self, image_idx: int) -> bool:
         """Whether the views of an image's points are few enough to be held at once."""
@@ -304,48 +304,6 @@ class JointSums:
         own, start, scores = first.views
         arguments = (own, first.around, start, tracks[0], scores, np.ascontiguousarray(moved), first.track_score)
         function(ctypes.byref(self._model), len(first.around), *arguments)
-
-    def normal(
-        self, image_idx: int, transform: FloatArray, cleaned: tuple[FloatArray, FloatArray]
-    ) -> NormalOfImage | None:
-        """What an image adds to the normal equations.
-
-        Parameters
-        ----------
-        transform : (C, C) T of the image        cleaned : (n, 2) residuals off the points, of both systems
-        """
-        function = kernel(
-            "joint_normal", _ModelPointer, Ints, Size, Size, *([Doubles] * 3), Ints, Ints, *([Doubles] * 4)
-        )
-        views, width = int(self._num_views[image_idx]), self.width
-        if function is None or any(values.shape != self._held["left"].shape for values in cleaned):
-            return None
-        most, place = min(views, self._num_images), np.zeros(self._num_images, dtype=np.int64)
-        around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
-        slabs, grams, rights = np.empty((2, most, width, width)), np.empty((2, width, width)), np.empty((2, width))
-        given = doubles(transform, (width, width)), *cleaned
-        found = around, num, slabs[0], slabs[1], grams, rights
-        status = function(ctypes.byref(self._model), place, image_idx, views, *given, *found)
-        if status != DONE:
-            return None
-        m = int(num[0])  # copies: room was for everybody
-        return NormalOfImage(around[:m].copy(), slabs[:, :m].copy(), grams, rights)
-
-    def meat(self, image_idx: int, transform: FloatArray) -> tuple[IntArray, FloatArray] | None:
-        """(m,) the image and those behind it that see its points; (m, C, C) scores times its own, summed.
-
-        ``transform`` (C, C): T of the image; its own scores are with it, those of the others without theirs.
-        """
-        function = kernel("joint_meat", _ModelPointer, Ints, Size, Size, Doubles, SmallInts, Size, Ints, Ints, Doubles)
-        if function is None:
-            return None
-        views, width = int(self._num_views[image_idx]), self.width
-        most, place = min(views, self._num_images), np.zeros(self._num_images, dtype=np.int64)
-        around, num = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
-        slab = np.empty((most, width, width))
-        given = doubles(transform, (width, width)), *self.tracks(image_idx)
-        status = function(ctypes.byref(self._model), place, image_idx, views, *given, around, num, slab)
-        return (around[: int(num[0])].copy(), slab[: int(num[0])].copy()) if status == DONE else None
 
     def off_points(
         self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True

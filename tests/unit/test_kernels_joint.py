@@ -28,6 +28,7 @@ from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.joint import JointArrays, JointSums
+from sfm_audit.audit.kernels.joint_normal import meats, normals
 from sfm_audit.audit.kernels.joint_parts import (
     dense_entries,
     near_entries,
@@ -293,8 +294,9 @@ def test_extreme_numbers_come_through_as_numbers(value):
     assert half.track_score.shape == (3, 44)
     steps, cleaned = sums.off_points(arrays.left_px)
     assert (steps.shape, cleaned.shape) == ((3, 3), (6, 2))
-    assert sums.normal(1, np.eye(8), (cleaned, cleaned)).around.tolist() == [1]
-    assert sums.meat(0, np.eye(8))[1].shape == (2, 8, 8)
+    one, first, turn = np.array([1]), np.array([0]), np.stack([np.eye(8)] * 2)
+    assert normals(sums, one, turn, (cleaned, cleaned)).pairs.around.tolist() == [1]
+    assert meats(sums, first, turn).slabs.shape == (1, 2, 8, 8)
 
 
 def test_an_image_without_observations_has_nothing_around():

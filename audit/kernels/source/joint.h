@@ -1,4 +1,4 @@
-/* What joint.c, joint_scores.c and joint_common.c share: the model of the joint system. */
+/* What joint.c, joint_normal.c, joint_scores.c and joint_common.c share: the model of the joint system. */
 #ifndef SFM_AUDIT_JOINT_H
 #define SFM_AUDIT_JOINT_H
 
@@ -35,6 +35,72 @@ typedef struct {
     const int32_t *observation_row;           /* (num_residuals) rows of observed */
     int64_t num_residuals;
 } seen_points;
+
+/* Who sees the points of an image: views (v) by image, which row of the image's own shows the point, who they are. */
+typedef struct {
+    int32_t *view, *own;
+    int64_t *image, *start; /* (m), (m + 1) */
+    int64_t num_images, num_views;
+} surroundings;
+
+static int by_number(const void *left, const void *right) {
+    int64_t a = *(const int64_t *)left, b = *(const int64_t *)right;
+    return (a > b) - (a < b);
+}
+
+/* Collect the views of the points of rows first <= row < last of an image, those of images before `from` left out. A point
+ * that the image shows twice has its views twice, once for each of the rows. place: (num_images) zeros, zeros again at the
+ * end. */
+static inline void collect(const joint_model *m, int64_t first, int64_t last, int64_t from, int64_t *place, surroundings *out) {
+    int64_t count = 0, total = 0;
+    for (int64_t row = first; row < last; row++) {
+        int64_t point = m->point_idx[row];
+        if (row + 2 * AHEAD < last) SOON(m->point_offsets + m->point_idx[row + 2 * AHEAD]);
+        if (row + AHEAD < last) SOON(m->image_of + m->point_offsets[m->point_idx[row + AHEAD]]);
+        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
+            int64_t image = m->image_of[k];
+            if (image >= from && !place[image]++) out->image[count++] = image;
+        }
+    }
+    qsort(out->image, (size_t)count, sizeof *out->image, by_number);
+    for (int64_t k = 0; k < count; k++) {
+        int64_t here = place[out->image[k]];
+        out->start[k] = place[out->image[k]] = total;
+        total += here;
+    }
+    out->start[count] = total;
+    out->num_images = count, out->num_views = total;
+    for (int64_t row = first; row < last; row++) {
+        int64_t point = m->point_idx[row];
+        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
+            int64_t image = m->image_of[k];
+            if (image >= from) {
+                out->view[place[image]] = m->by_point[k];
+                out->own[place[image]++] = (int32_t)(row - first);
+            }
+        }
+    }
+    for (int64_t k = 0; k < count; k++) place[out->image[k]] = 0;
+}
+
+/* Rows of views follow each other at random: ask for those that come soon. */
+static inline void soon(const joint_model *m, const int32_t *view, int64_t j, int64_t end) {
+    if (j + AHEAD < end) {
+        const double *design = m->design + view[j + AHEAD] * 2 * m->width;
+        for (int64_t c = 0; c < 2 * m->width + 8; c += 8) SOON(design + (c < 2 * m->width ? c : 2 * m->width - 1));
+        SOON(m->weight + view[j + AHEAD]);
+    }
+}
+
+/* Two rows of numbers, padded with zeros so that loops over them have a length that the compiler knows. */
+typedef struct {
+    double x[MOST_COLUMNS], y[MOST_COLUMNS];
+} pair_of_rows;
+
+INLINE void take_rows(
+    const double *x, const double *y, int64_t count, pair_of_rows *out) {
+    for (int64_t c = 0; c < count; c++) out->x[c] = x[c], out->y[c] = y[c];
+}
 
 /* joint_scores.c */
 void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted);
