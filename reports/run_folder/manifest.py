@@ -107,9 +107,8 @@ def with_hash(lines: Iterable[bytes]) -> tuple[list[bytes], ManifestRecord]:
 
 def _last_lines(content: bytes) -> tuple[bytes, ...]:
     """Return the last line of each key in the order of keys; the rest of a line that was being written is left out."""
-    whole = content[: content.rfind(b"\n") + 1]
     last: dict[str, bytes] = {}
-    for line in whole.split(b"\n")[:-1]:
+    for line in content.split(b"\n")[:-1]:
         last[_key_of(line)] = line
     return tuple(last[key] for key in sorted(last) if not last[key].endswith(_DROPPED))
 

@@ -104,6 +104,15 @@ def test_several_paths_to_one_model_name_it_once(tmp_path: Path):
     assert found == [("d", "t", "0"), ("link", "link", "0")]
 
 
+def test_a_model_that_one_path_names_as_its_layout_has_it_is_not_left_out_by_another(tmp_path: Path):
+    plant(tmp_path / "d", "s/sparse/manhattan/0")
+    (tmp_path / "x").symlink_to(tmp_path / "d" / "s" / "sparse" / "manhattan" / "0")
+    found = discover([tmp_path / "d", tmp_path / "x"], layout="megadepth")
+    assert [(ref.scene, ref.component) for ref in found.refs] == [("s", "0")]
+    assert found.left_out == ()
+    assert [ref.scene for ref in discover([tmp_path / "x"], layout="megadepth").left_out] == ["x"]
+
+
 def test_links_are_followed_and_loops_end(tmp_path: Path):
     plant(tmp_path / "elsewhere", "sparse/0")
     (tmp_path / "d" / "s").mkdir(parents=True)

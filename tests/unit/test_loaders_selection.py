@@ -1,5 +1,6 @@
 """Which models are asked for, and what is said of names that fit nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,12 @@ def test_globs():
     assert chosen(scenes=("001*",)) == NAMES[3:], "a star crosses a slash"
     assert chosen(scenes=("0001", "0022")) == NAMES[:3]
     assert chosen(components=("[1-9]",)) == NAMES[1:2]
+
+
+def test_what_a_layout_left_out_stays_left_out():
+    elsewhere = ModelRef("d", "x", "0", "/x-0", "x-0")
+    found = select(replace(FOUND, left_out=(elsewhere,)), Selection(scenes=("0001", "0022")))
+    assert [ref.location for ref in found.left_out] == ["/001/234-0", "/001/235-0", "/x-0"]
 
 
 def test_lists(listed):

@@ -166,6 +166,14 @@ def test_models_that_contradict_themselves_are_refused_in_one_line(tmp_path):
     assert str(source) in str(caught.value)
 
 
+def test_links_to_points_that_do_not_exist_are_refused(tmp_path):
+    first, *others = tiny_model().images
+    images = (Image(first.image_id, first.name, (*first.points2d, (7.0, 8.0, 999))), *others)
+    source = write_binary(tmp_path / "in", tiny_model().but(images=images))
+    with pytest.raises(LoadError, match="images and tracks agree"):
+        prune(source, {90}, tmp_path / "out")
+
+
 def test_what_pycolmap_refuses_is_one_line(tmp_path):
     images = (*tiny_model().images[:2], Image(90, "x.jpg", camera_id=55))
     source = write_binary(tmp_path / "in", tiny_model().but(images=images))

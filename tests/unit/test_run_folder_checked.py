@@ -128,6 +128,14 @@ def test_a_manifest_that_does_not_fit_is_refused_and_the_intact_models_stay(run,
     assert len([each for each in known if each]) == {"cut": 1, "flipped": 1}.get(change, 0)
 
 
+def test_a_run_json_that_counts_other_models_than_its_manifest_has_is_refused(run):
+    info = json.loads((run / "run.json").read_text())
+    info["manifest"]["num_models"] += 1
+    (run / "run.json").write_text(json.dumps(info))
+    with pytest.raises(DamagedRunError, match=r"its manifest\.jsonl names 2 models, its run\.json 3"):
+        RunReader.open(run)
+
+
 def test_a_model_that_the_manifest_does_not_name_is_not_there(run):
     stranger = make_ref("data/c/sparse/0", scene="c")
     with RunStore(run.parent / "OTHER", settings()) as store:

@@ -203,6 +203,19 @@ def test_a_model_that_changed_or_was_not_audited_is_refused(audited):
         images_of_model(run, images, folder / "a")
 
 
+def test_a_copy_of_two_audited_models_is_neither(tmp_path):
+    folders = [write_binary(tmp_path / name, tiny_model()) for name in ("a", "b", "copy")]
+    entries = [
+        (ModelRef(folder.name, "s", "0", str(folder.resolve()), folder.name), ["1.jpg"], ("accepted",), state)
+        for folder in folders[:2]
+        for state in [read_input_state(str(folder))]
+    ]
+    run = write_run(tmp_path / "RUN", *entries)
+    with pytest.raises(RunFolderError, match=r"holds 2 audits of copies of .*copy; name one of its models \("):
+        images_of_model(run, read_images(run), folders[2])
+    assert images_of_model(run, read_images(run), folders[1])[0].model_path == "b"
+
+
 def test_a_table_without_a_column_is_named():
     run = SimpleNamespace(
         folder=Path("RUN"), info={"status": "complete"}, rows=lambda *_: iter([dict.fromkeys(COLUMNS[:-1])])
