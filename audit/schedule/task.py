@@ -12,11 +12,11 @@ import pyarrow as pa
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.engine.model import audit_model
 from sfm_audit.audit.kernels import path_taken
-from sfm_audit.audit.kernels.threads import threads
+from sfm_audit.audit.kernels.threads import num_threads, threads, together
 from sfm_audit.audit.schedule.images import image_processes
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.loaders import LoadError, ModelRef, open_model
-from sfm_audit.loaders.datasets.input_state import InputState, read_input_state
+from sfm_audit.loaders.datasets.input_state import InputState, input_stamp, read_input_state
 from sfm_audit.loaders.evidence import Given
 from sfm_audit.loaders.formats import keypoint_scales_of, verified_pairs_of
 from sfm_audit.loaders.model import SparseModel
@@ -134,10 +134,10 @@ def audit_one(task: Task) -> Outcome:
     # processes start while the model is read
     with threads(task.num_threads), image_processes(task.num_processes, paths) as spread:
         try:
-            state = replace(read_input_state(ref.location), evidence=evidence_of(ref, task.config))
-            if state.digest == task.known_digest:
+            content, model = _read(ref.location, task.known_digest)
+            if model is None:
                 return Unchanged()
-            model = open_model(ref.location)
+            state = replace(content, evidence=evidence_of(ref, task.config))
             scale_px = keypoint_scales_of(model, ref.model_path) if task.config.noise == "keypoint" else None
             given = _given(task, model)
         except LoadError as error:
@@ -149,6 +149,21 @@ def audit_one(task: Task) -> Outcome:
             model, task.config, labels, scale_px, observations=task.observations, spread=spread, given=given
         )
     return Audited(state, audited.tables, time.perf_counter() - start, "+".join(sorted(paths)))
+
+
+def _read(location: str, known_digest: str | None) -> tuple[InputState, SparseModel | None]:
+    """Return the state of a model's files and the model; None where the state is known.
+
+    Where nothing is known and two threads may work, the files are hashed while they are read. If they changed meanwhile
+    they are read once more, hashed first: the state must never be newer than what was audited.
+    """
+    if known_digest is None and num_threads() > 1:
+        states, models = list[InputState](), list[SparseModel]()
+        together(lambda: states.append(read_input_state(location)), lambda: models.append(open_model(location)))
+        if input_stamp(location) == states[0].stamp:
+            return states[0], models[0]
+    state = read_input_state(location)
+    return state, None if state.digest == known_digest else open_model(location)
 
 
 def _given(task: Task, model: SparseModel) -> Given:

@@ -1,4 +1,5 @@
 import os
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import threadpoolctl
 from run_samples import write_models
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.kernels.threads import threads
 from sfm_audit.audit.schedule import task as task_module
 from sfm_audit.audit.schedule.runner import Failure, Limits, audit_many, audit_one
 from sfm_audit.loaders import LoadError, discover
@@ -263,3 +265,38 @@ def test_the_state_of_a_model_covers_all_its_files(tmp_path):
         (folder / name).write_bytes(b"changed")
         states.append(read_input_state(str(folder)))
     assert len({state.digest for state in states}) == len({state.stamp for state in states}) == 4
+
+
+def test_files_are_hashed_while_they_are_read_where_two_threads_may_work(refs, monkeypatch):
+    location = refs[0].location
+    expected = read_input_state(location)
+    names = []
+    for name in ("read_input_state", "open_model"):
+        real = getattr(task_module, name)
+        said = lambda where, name=name, real=real: names.append((name, threading.get_ident())) or real(where)  # noqa: E731
+        monkeypatch.setattr(task_module, name, said)
+    with threads(2):
+        state, model = task_module._read(location, None)
+        assert (state, model.location) == (expected, location)
+        assert len({thread for _, thread in names}) == 2
+        names.clear()
+        assert task_module._read(location, expected.digest) == (expected, None)
+        assert [name for name, _ in names] == ["read_input_state"]
+
+
+def test_files_that_change_while_they_are_hashed_and_read_are_read_again(refs, monkeypatch):
+    location, read, states = refs[0].location, task_module.read_input_state, []
+
+    def changing(where: str) -> InputState:
+        states.append(read(where))
+        if len(states) == 1:
+            path = Path(where) / "points3D.bin"
+            os.utime(path, ns=(0, 0))
+        return states[-1]
+
+    monkeypatch.setattr(task_module, "read_input_state", changing)
+    with threads(2):
+        state, _ = task_module._read(location, None)
+    assert len(states) == 2
+    assert state == states[1] != states[0]
+    assert state.stamp == input_stamp(location)
