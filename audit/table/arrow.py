@@ -108,8 +108,10 @@ def _build_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
 
 def _number_array(values: Values, kind: pa.DataType) -> pa.Array[Any]:
     dtype = np.dtype(str(kind))
-    if type(values) is np.ndarray and values.dtype == dtype == np.float64:  # no mask
-        return pa.Array.from_buffers(kind, len(values), [_validity(np.isfinite(values)), _buffer(values)])
+    if type(values) is np.ndarray and values.dtype == dtype:  # no mask, and every number fits
+        known = _validity(np.isfinite(values)) if dtype.kind == "f" else None
+        data = _pack_bits(values) if dtype.kind == "b" else _buffer(values)
+        return pa.Array.from_buffers(kind, len(values), [known, data])
     array, valid = _split_missing(values, dtype)
     if len(array) and array.dtype.kind not in {"f": "fiu", "b": "b"}.get(dtype.kind, "iu"):
         raise TypeError(f"expected {kind}, found {array.dtype}")

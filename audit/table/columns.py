@@ -353,6 +353,11 @@ def schema(table: TableName, groups: Collection[ColumnGroup] = ()) -> pa.Schema:
 
     groups: of the images table, which columns it has besides those that are always there.
     """
+    return _schema(table, frozenset(groups))
+
+
+@cache
+def _schema(table: TableName, groups: frozenset[ColumnGroup]) -> pa.Schema:
     columns = [
         *TABLES[table],
         *(column for group in GROUP_COLUMNS if group in groups for column in GROUP_COLUMNS[group]),
