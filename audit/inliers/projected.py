@@ -15,7 +15,7 @@ from sfm_audit.audit.cameras import normalised, project_columns
 from sfm_audit.audit.inliers.residuals import ImageResiduals, ModelResiduals
 from sfm_audit.audit.inliers.stationarity import pose_columns
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet, SparseModel
+from sfm_audit.loaders.model import CameraRecord, ImageRecord, InlierSet, SparseModel, rotation_from_quat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,23 +58,43 @@ class ImageInliers:
         return len(self.xy_px)
 
     @property
+    def predicted_px(self) -> FloatArray:
+        """(2, n) px, without projecting again: observed - residual."""
+        return np.subtract(self.xy_px.T, self.residuals_px, order="C")
+
+    @property
+    def u(self) -> FloatArray:
+        """(2, n) as of `ProjectedImage`."""
+        return np.ascontiguousarray(normalised(self.camera.model, self.camera.params, self.xyz_cam).T)
+
+    @property
     def projected(self) -> ProjectedImage:
-        """What the camera predicts, without projecting again: predicted = observed - residual."""
-        model, params = self.camera.model, self.camera.params
-        xy_px = np.subtract(self.xy_px.T, self.residuals_px, order="C")
-        u = np.ascontiguousarray(normalised(model, params, self.xyz_cam).T)
-        pose = pose_columns(self.jacobian_cam, self.xyz_cam)
-        return ProjectedImage(xy_px, u, pose, _d_params(self.camera, xy_px, self.d_extra))
+        """What the camera predicts, without projecting again."""
+        xy_px, pose = self.predicted_px, pose_columns(self.jacobian_cam, self.xyz_cam)
+        return ProjectedImage(xy_px, self.u, pose, _d_params(self.camera, xy_px, self.d_extra))
+
+
+def cams_from_gradients(quat_cam_from_world_wxyz: FloatArray) -> FloatArray:
+    """Return (B, 3, 3) from derivatives in a point in the world to those in the camera's frame, of (B, 4) poses.
+
+    d / d world = d / d cam R; R of a quaternion that is no unit has no transpose for an inverse.
+    """
+    return np.asarray(np.linalg.pinv(rotation_from_quat(quat_cam_from_world_wxyz).swapaxes(-1, -2)))
 
 
 def image_inliers(
-    model: SparseModel, residuals: ModelResiduals, image_idx: int, chosen: IntArray | None = None
+    model: SparseModel,
+    residuals: ModelResiduals,
+    image_idx: int,
+    chosen: IntArray | None = None,
+    cam_from_gradient: FloatArray | None = None,
 ) -> ImageInliers:
     """Return the inliers of the image in row ``image_idx`` of a model.
 
     Parameters
     ----------
     chosen : which of the image's inliers; all when None
+    cam_from_gradient : (3, 3) that of the image out of `cams_from_gradients`, where several were made at once
 
     Raises
     ------
@@ -86,8 +106,7 @@ def image_inliers(
         raise ValueError(f"image {image.image_id} has no camera")
     columns: IntArray | slice = rows if chosen is None else rows.start + chosen
     xyz_world = model.points.xyz_world.take(residuals.point_idx[columns], axis=0)
-    # d / d world = d / d cam R; R of a quaternion that is no unit has no transpose for an inverse
-    cam_from_gradient = np.linalg.pinv(image.rotation_cam_from_world.T)
+    turn = np.linalg.pinv(image.rotation_cam_from_world.T) if cam_from_gradient is None else cam_from_gradient
     d_extra = residuals.d_extra[image_idx]
     return ImageInliers(
         image,
@@ -96,7 +115,7 @@ def image_inliers(
         xyz_world,
         residuals.residuals_px[:, columns],
         np.asfortranarray(image.cam_from_world(xyz_world)),
-        cam_from_gradient @ residuals.point_jacobian[:, :, columns],
+        turn @ residuals.point_jacobian[:, :, columns],
         d_extra if chosen is None else d_extra.take(chosen, axis=2),
     )
 

@@ -12,13 +12,14 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 _SMALLEST_PIVOT = 1e-10  # of the Gram matrix of unit columns; below it the orthonormal basis is taken by SVD
 
 
-def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
+def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray, out: FloatArray | None = None) -> FloatArray:
     """Return (6, 2, n): d projection / d (rotation, translation), left perturbation in the camera frame.
 
     Parameters
     ----------
     jacobian_cam : (2, 3, n) d projection / d point in the camera frame, px per model unit
     xyz_cam : (n, 3) points in the camera frame, model units
+    out : (6, 2, n) where they go; an array of their own when None
 
     Notes
     -----
@@ -26,10 +27,10 @@ def pose_columns(jacobian_cam: FloatArray, xyz_cam: FloatArray) -> FloatArray:
     """
     x, y, z = xyz_cam.T
     jx, jy, jz = jacobian_cam.transpose(1, 0, 2)
-    out = np.empty((6, *jx.shape))
-    out[0] = jz * y - jy * z
-    out[1] = jx * z - jz * x
-    out[2] = jy * x - jx * y
+    out = np.empty((6, *jx.shape)) if out is None else out
+    for place, (a, b, along_a, along_b) in enumerate(((jz, jy, y, z), (jx, jz, z, x), (jy, jx, x, y))):
+        np.multiply(a, along_a, out=out[place])
+        out[place] -= b * along_b
     out[3:] = jacobian_cam.transpose(1, 0, 2)
     return out
 

@@ -13,7 +13,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.inliers.projected import ProjectedImage
+from sfm_audit.audit.inliers.projected import ImageInliers
+from sfm_audit.audit.inliers.stationarity import pose_columns
 from sfm_audit.audit.kernels.misfit import NUM_FEATURES
 from sfm_audit.audit.misfit import basis
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, OWN_COEFFICIENTS
@@ -62,19 +63,19 @@ class ImageFeatures(NamedTuple):
         return len(self.rows) - 1 - SHUTTER.stop
 
 
-def image_features(camera: CameraRecord, projected: ProjectedImage, residuals_px: FloatArray) -> ImageFeatures:
-    """Return the features of an image, of a camera that has fields, from what it predicts and residuals (2, n)."""
-    chosen = fitted_param_idxs(camera.model)
-    q = len(projected.pose) + len(chosen)
-    rows = np.empty((q + 1 + SHUTTER.stop, *residuals_px.shape))
-    rows[:6], rows[q] = projected.pose, residuals_px
-    for place, idx in enumerate(chosen):  # as `nuisance_columns`, without a copy of its own
-        rows[6 + place] = projected.d_params[idx]
+def image_features(inliers: ImageInliers) -> ImageFeatures:
+    """Return the features of the inliers of an image, of a camera that has fields."""
+    camera, xy_px = inliers.camera, inliers.predicted_px
+    q = 6 + len(fitted_param_idxs(camera.model))
+    rows = np.empty((q + 1 + SHUTTER.stop, *xy_px.shape))
+    rows[q] = inliers.residuals_px
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left to `prepare`
-        row = (projected.xy_px[1] - 0.5 * camera.height) / camera.height
-        np.multiply(projected.pose, row, out=rows[q + 5 :])
-        _fill_lens(rows[q + 1 : q + 5], camera, projected)
-        return ImageFeatures(rows, _monomials(camera, projected.xy_px))
+        pose = pose_columns(inliers.jacobian_cam, inliers.xyz_cam, out=rows[:6])
+        _fill_intrinsics(rows[6:q], camera, xy_px, inliers.d_extra)
+        row = (xy_px[1] - 0.5 * camera.height) / camera.height
+        np.multiply(pose, row, out=rows[q + 5 :])
+        _fill_lens(rows[q + 1 : q + 5], camera, inliers.u, inliers.d_extra)
+        return ImageFeatures(rows, _monomials(camera, xy_px))
 
 
 def affine_offset(camera: CameraRecord) -> tuple[float, float]:
@@ -84,11 +85,24 @@ def affine_offset(camera: CameraRecord) -> tuple[float, float]:
     return (0.5 * camera.width - cx) / half, (0.5 * camera.height - cy) / half
 
 
-def _fill_lens(out: FloatArray, camera: CameraRecord, projected: ProjectedImage) -> None:
+def _fill_intrinsics(out: FloatArray, camera: CameraRecord, xy_px: FloatArray, d_extra: FloatArray) -> None:
+    """Columns of `fitted_param_idxs`, as `nuisance_columns` takes them from the derivatives in all parameters."""
+    model, params = camera.model, camera.params
+    for place, idx in enumerate(fitted_param_idxs(model)):
+        if idx in model.extra_idxs:
+            out[place] = d_extra[model.extra_idxs.index(idx)]
+            continue
+        for axis, focal in enumerate((model.focal_idxs[0], model.focal_idxs[-1])):
+            if focal == idx:  # x = f v + c
+                np.divide(xy_px[axis] - params[model.principal_point_idxs[axis]], params[focal], out=out[place, axis])
+            else:
+                out[place, axis] = 0.0
+
+
+def _fill_lens(out: FloatArray, camera: CameraRecord, u: FloatArray, d_extra: FloatArray) -> None:
     """Radial and tangential columns of `candidate_fields`, (4, 2, n)."""
     focals = camera.model.focal_idxs
     scale = np.array([[camera.params[focals[0]]], [camera.params[focals[-1]]]])
-    u = projected.u
     square = u * u
     r2 = square[0] + square[1]
     np.multiply(u * scale, r2 * r2, out=out[0])
@@ -99,8 +113,8 @@ def _fill_lens(out: FloatArray, camera: CameraRecord, projected: ProjectedImage)
     out[2:] *= scale
     starts = {MisfitGroup.RADIAL: 0, MisfitGroup.TANGENTIAL: 2}
     for group, names in OWN_COEFFICIENTS.get(camera.model.name, {}).items():
-        own = [camera.model.param_names.index(name) for name in names]
-        out[starts[group] : starts[group] + 2] = projected.d_params[own]
+        own = [camera.model.extra_idxs.index(camera.model.param_names.index(name)) for name in names]
+        out[starts[group] : starts[group] + 2] = d_extra[own]
 
 
 def _monomials(camera: CameraRecord, xy_px: FloatArray) -> FloatArray:

@@ -285,7 +285,9 @@ def add_rows(target: FloatArray, rows: IntArray | Int32Array, values: FloatArray
     number = np.arange(len(rows))
     last_row[rows] = number
     if (last_row[rows] == number).all():
-        target[rows] += values
+        sums = target.take(rows, axis=0)
+        sums += values
+        target[rows] = sums
     else:
         np.add.at(target, rows, values)
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sfm_audit.audit.cameras.models import functions_of
-from sfm_audit.audit.inliers.projected import ImageInliers, image_inliers
+from sfm_audit.audit.inliers.projected import cams_from_gradients, image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.misfit import (
@@ -44,7 +44,7 @@ from sfm_audit.audit.misfit.score import Clusters
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray, distinct
 from sfm_audit.loaders.camera_models import CameraModel
-from sfm_audit.loaders.model import CameraRecord, SparseModel, rotation_from_quat
+from sfm_audit.loaders.model import CameraRecord, SparseModel
 
 _MAX_IMAGES: Final = 64
 _FEW_OF_POINTS: Final = 8  # observations of fewer than this share of the model's points are sorted
@@ -113,10 +113,6 @@ class ModelSums:
         """Inliers of the image in this row."""
         rows = self.residuals.rows(image)
         return int(rows.stop - rows.start)
-
-    def inliers(self, image: int) -> ImageInliers:
-        """Inliers of the image in this row."""
-        return image_inliers(self.model, self.residuals, image)
 
     def keypoints(self, image: int) -> FloatArray:
         """(n, 2) observed, of the image in this row."""
@@ -188,10 +184,11 @@ class ModelSums:
         compiled = kernels_in_use() and 6 + len(fitted_param_idxs(model)) <= MAX_OWN
         return compiled or num <= AT_ONCE
 
-    def features(self, image: int) -> ImageFeatures:
-        """Features of the image in this row."""
-        own = self.inliers(image)
-        return image_features(own.camera, own.projected, own.residuals_px)
+    def features(self, images: Sequence[int]) -> Iterator[ImageFeatures]:
+        """Yield the features of the images in these rows."""
+        turns = cams_from_gradients(self.model.images.quat_cam_from_world_wxyz[np.array(images, dtype=np.int64)])
+        for image, turn in zip(images, turns, strict=True):
+            yield image_features(image_inliers(self.model, self.residuals, image, cam_from_gradient=turn))
 
     def windows(self, images: Sequence[int]) -> Iterator[WindowSums]:
         """Yield images of one camera model, as many as are summed up at a time; each of them `can_sum`."""
@@ -217,7 +214,7 @@ class ModelSums:
         quats = table.quat_cam_from_world_wxyz[chosen]
         numbers = np.empty((len(images), 22))
         numbers[:, :4], numbers[:, 4:7] = quats, table.translation_cam_from_world[chosen]
-        numbers[:, 7:16] = np.linalg.pinv(rotation_from_quat(quats).swapaxes(1, 2)).reshape(-1, 9)
+        numbers[:, 7:16] = cams_from_gradients(quats).reshape(-1, 9)
         numbers[:, 16:] = [_lens_numbers(camera) for camera in cameras]
         rows = np.stack([offsets[chosen], offsets[chosen + 1]], axis=1).astype(np.int64)
         extra = tuple(self.residuals.d_extra[image] for image in images)
@@ -266,7 +263,7 @@ class WindowSums:
 
     @cached_property
     def _features(self) -> list[ImageFeatures]:
-        return [self._source.features(image) for image in self.images]
+        return list(self._source.features(self.images))
 
     def sums(self) -> tuple[FloatArray, FloatArray]:
         """Return `sums_of` each image: (B, q + 40, q + 40) and (B, q + 40)."""
@@ -360,7 +357,9 @@ class WindowSums:
         for b, features in enumerate(self._features):
             basis, on_y, coefficients = (each[b] for each in profile)
             g = scores_of(features, weights_of(features, basis, on_y).weights)
-            own = g[self.num_own :] - coefficients.T @ g[: self.num_own]
+            own = g[self.num_own :]
+            own -= coefficients.T @ g[: self.num_own]
             track = tracks.of_row[self._source.residuals.rows(self.images[b])]
             inside = (track >= tracks.first) & (track < tracks.last)
-            add_rows(per_track, track[inside] - tracks.first, own.T[inside], last_row)
+            chosen = slice(None) if inside.all() else inside
+            add_rows(per_track, track[chosen] - tracks.first, own.T[chosen], last_row)

@@ -103,7 +103,7 @@ def test_features_span_the_candidate_fields(tmp_path):
     model, residuals = model_of(tmp_path, "OPENCV", (200,))
     own = image_inliers(model, residuals, 0)
     fields = candidate_fields(own.camera, own.projected).reshape(42, -1)
-    gram, _ = sums_of(image_features(own.camera, own.projected, own.residuals_px))
+    gram, _ = sums_of(image_features(own))
     q = len(gram) - NUM_FEATURES
     found = widened(gram[None], np.array([affine_offset(own.camera)]), q)[0, q:, q:]
     root = np.sqrt(np.diagonal(found))
