@@ -61,12 +61,13 @@ def call_near_entries(rng: np.random.Generator) -> None:
     from sfm_audit.audit.kernels.joint_parts import near_entries  # noqa: PLC0415 - in the child only
 
     for _ in range(20):
-        width, size = int(rng.integers(1, 9)), int(rng.integers(1, 60))
-        first = np.arange(0, size, width)
-        rows, columns = np.minimum(width, size - first), np.minimum(4 * width, size - first)
+        size = int(rng.integers(1, 60))
+        first = np.unique([0, *rng.integers(0, size, int(rng.integers(0, 12))), size]).astype(np.int64)
+        rows, columns = np.diff(first), np.minimum(first[:-1] + rng.integers(1, 40), size) - first[:-1]
+        columns = np.maximum(columns, rows)
         starts = np.concatenate([[0], np.cumsum(rows * columns)]).astype(np.int64)
         place = np.sort(rng.choice(size, int(rng.integers(0, size + 1)), replace=False)).astype(np.int64)
-        near_entries(place, width, rng.normal(size=int(starts[-1])), starts, columns.astype(np.int64))
+        near_entries(place, first, rng.normal(size=int(starts[-1])), starts, columns.astype(np.int64))
 
 
 def call_dense_entries(rng: np.random.Generator) -> None:

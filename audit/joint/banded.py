@@ -31,19 +31,29 @@ _MAX_BORDER: Final = 128
 class Band:
     """How the columns of a sparse symmetric matrix are ordered into blocks that couple with the next one only.
 
-    order: (D,) column at each place.    place: (D,) of each column.    width: of a block; the last one may be smaller.
-    num_banded: places of the band; the border behind them couples with everything.
+    order: (D,) column at each place.    place: (D,) of each column.    width: how far places couple.
+    starts: (b + 1,) where each block begins and the last one ends, none longer than the width; the border behind them
+    couples with everything.
     """
 
     order: IntArray
     place: IntArray
     width: int
-    num_banded: int
+    starts: IntArray
+
+    @property
+    def num_banded(self) -> int:
+        """Places of the band."""
+        return int(self.starts[-1])
 
     def blocks(self) -> Iterator[slice]:
         """Places of each block."""
-        for start in range(0, self.num_banded, self.width):
-            yield slice(start, min(start + self.width, self.num_banded))
+        for start, stop in pairwise(self.starts.tolist()):
+            yield slice(start, stop)
+
+    def number(self, place: IntArray) -> IntArray:
+        """Which block has each of some places; one behind the last for the border."""
+        return np.asarray(np.searchsorted(self.starts, place, side="right") - 1)
 
     @property
     def num_border(self) -> int:
@@ -74,8 +84,24 @@ def _ordered(matrix: sparse.csr_array, border: IntArray) -> Band:
     place = np.empty(size, dtype=np.int64)
     place[order] = np.arange(size)
     by_row = place[inner].astype(np.int32)
-    width = int(np.abs(np.repeat(by_row, np.diff(within.indptr)) - by_row[within.indices]).max(initial=0))
-    return Band(order, place, max(width, 1), inner.size)
+    reach, used = np.arange(inner.size), np.flatnonzero(np.diff(within.indptr))
+    furthest = np.maximum.reduceat(by_row[within.indices], within.indptr[used]) if used.size else by_row[used]
+    reach[by_row[used]] = np.maximum(reach[by_row[used]], furthest)
+    width = max(int((reach - np.arange(inner.size)).max(initial=0)), 1)
+    return Band(order, place, width, _starts(reach, width))
+
+
+def _starts(reach: IntArray, width: int) -> IntArray:
+    """Blocks as short as can be when each ends behind all that the one before it couples with, or half a width long.
+
+    reach : (n,) last place that each place couples with
+    """
+    behind = np.maximum.accumulate(reach) + 1
+    starts = [0]
+    while starts[-1] < reach.size:
+        here = starts[-1]
+        starts.append(min(max(int(behind[max(here - 1, 0)]), here + (width + 1) // 2), reach.size))
+    return np.array(starts, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +141,7 @@ class BandedFactor:
         out = np.array(right, order="C")
         out[self.band.num_banded :] = 0.0
         blocks = list(self.band.blocks())
-        first = int(np.argmax(out.any(axis=1))) // self.band.width
+        first = int(self.band.number(np.argmax(out.any(axis=1))))
         for i in range(first, len(blocks)):
             if i > first:
                 out[blocks[i]] -= self.below[i - 1] @ out[blocks[i - 1]]
@@ -227,7 +253,7 @@ class BandedInverse:
         place = self.factor.band.place[columns]
         order = np.argsort(place, kind="stable")
         order = order[: np.searchsorted(place[order], self.factor.band.num_banded)]
-        entries = near_entries(place[order], self.factor.band.width, self.flat, *_places_in_flat(self.near))
+        entries = near_entries(place[order], self.factor.band.starts, self.flat, *_places_in_flat(self.near))
         if entries is None:
             return np.asarray(self.block(columns) @ right)
         scale, aside, pull = self.inverse_scale[columns][:, None], self.aside[place], self.pull[place]
@@ -239,14 +265,15 @@ class BandedInverse:
 
     def blocks(self, columns: IntArray) -> FloatArray:
         """(B, k, k) entries of S^+ at columns (B, k)."""
-        place, width = self.factor.band.place[columns], self.factor.band.width
+        place, band = self.factor.band.place[columns], self.factor.band
         lower = np.minimum(place[:, :, None], place[:, None, :])
         higher = np.maximum(place[:, :, None], place[:, None, :])
         starts, sizes = _places_in_flat(self.near)
-        in_band = higher < self.factor.band.num_banded
-        number = np.where(in_band, lower // width, 0)
-        too_far = in_band & (higher - number * width >= sizes[number])
-        at = starts[number] + (lower - number * width) * sizes[number] + higher - number * width
+        in_band = higher < band.num_banded
+        number = np.where(in_band, band.number(lower), 0)
+        origin = band.starts[number]
+        too_far = in_band & (higher - origin >= sizes[number])
+        at = starts[number] + (lower - origin) * sizes[number] + higher - origin
         out = np.where(in_band, self.flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
         outer = self.aside[place] @ self.pull[place].swapaxes(1, 2)
         out -= outer + outer.swapaxes(1, 2)
@@ -260,12 +287,12 @@ class BandedInverse:
         """As compiled sums take it."""
         band, starts = self.factor.band, _places_in_flat(self.near)
         outer = self.aside, self.pull
-        return BandArrays(band.place, band.num_banded, band.width, self.flat, *starts, *outer, self.inverse_scale)
+        return BandArrays(band.place, band.starts, self.flat, *starts, *outer, self.inverse_scale)
 
     def _is_near(self, columns: IntArray) -> bool:
         """Whether all entries at some columns are at hand."""
-        place = self.factor.band.place[columns]
-        number = place[place < self.factor.band.num_banded] // self.factor.band.width
+        place, band = self.factor.band.place[columns], self.factor.band
+        number = band.number(place[place < band.num_banded])
         return not number.size or int(number.max() - number.min()) <= _REACH
 
     def block(self, columns: IntArray) -> FloatArray:
@@ -276,11 +303,11 @@ class BandedInverse:
         by_place = np.argsort(place, kind="stable")
         place = place[by_place]
         inner = int(np.searchsorted(place, band.num_banded))
-        number = place[:inner] // band.width
+        number = band.number(place[:inner])
         out = np.zeros((place.size, place.size))
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [inner]]).tolist()
         for start, stop in pairwise(bounds) if inner else ():
-            origin = number[start] * band.width
+            origin = band.starts[number[start]]
             part = self.near[number[start]][np.ix_(place[start:stop] - origin, place[start:inner] - origin)]
             out[start:stop, start:inner] = part
             out[stop:inner, start:stop] = part[:, stop - start :].T
@@ -305,8 +332,11 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     From the last block to the first, with U_i = C_i L_i^-1: X_(i, j) = -U_i^T X_(i+1, j) for j > i, and
     X_(i, i) = (L_i L_i^T)^-1 - X_(i, i+1) U_i.
     """
-    width, size = factor.band.width, factor.band.num_banded
-    shapes = [(own.stop - own.start, min((_REACH + 1) * width, size - own.start)) for own in factor.band.blocks()]
+    starts = factor.band.starts.tolist()
+    ends_of_reach = [*starts[_REACH + 1 :], *[starts[-1]] * _REACH]
+    shapes = [
+        (own.stop - own.start, end - own.start) for own, end in zip(factor.band.blocks(), ends_of_reach, strict=False)
+    ]
     ends = np.cumsum([rows * columns for rows, columns in shapes])
     flat = np.empty(int(ends[-1]))
     near = [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
@@ -317,7 +347,7 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
             near[i][...] = own
             continue
         u = _triangular(factor.diagonal[i], factor.below[i].T, transposed=True).T
-        beside = -u.T @ near[i + 1][:, : _REACH * width]
+        beside = -u.T @ near[i + 1][:, : near[i].shape[1] - len(own)]
         own -= beside[:, : len(u)] @ u
         near[i][:, : len(own)], near[i][:, len(own) :] = 0.5 * (own + own.T), beside
     null = factor.null

@@ -38,14 +38,14 @@ def banded_sandwiches(
     for block in blocks:
         place = band.place[block]
         inner = place < band.num_banded
-        number = place[inner] // band.width
+        number = band.number(place[inner])
         first = int(number.min()) if number.size else 0
         if number.size and number.max() - first > 1:
             out.append(None)
             continue
         outer = aside[place] @ pull[place].T
         values = -outer - outer.T
-        values[np.ix_(inner, inner)] += _entries(near, place[inner], first * band.width, first)
+        values[np.ix_(inner, inner)] += _entries(near, place[inner], int(band.starts[first]), first)
         out.append(values * scale[block] * scale[block][:, None])
     return out
 

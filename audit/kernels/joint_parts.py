@@ -140,22 +140,23 @@ def two_informations(
 
 
 def near_entries(
-    place: IntArray, width: int, near: FloatArray, starts: IntArray, columns: IntArray
+    place: IntArray, first: IntArray, near: FloatArray, starts: IntArray, columns: IntArray
 ) -> FloatArray | None:
     """(s, s) entries at sorted places of a banded symmetric matrix; None where not all are at hand, or without kernels.
 
     Parameters
     ----------
-    near : (m,) of each block of ``width`` rows its entries at the columns of the block and of those behind it
+    first : (b + 1,) place where each block begins and the last one ends
+    near : (m,) of each block its rows' entries at the columns of the block and of those behind it
     starts, columns : (b + 1,) where each block begins in it, and (b,) how many columns it has
     """
-    function = kernel("joint_near_entries", Size, Ints, Size, Doubles, Ints, Ints, Size, Doubles)
+    function = kernel("joint_near_entries", Size, Ints, Ints, Doubles, Ints, Ints, Size, Doubles)
     if function is None:
         return None
-    if len(starts) != len(columns) + 1 or starts[-1] != near.size or width < 1:
+    if not len(starts) == len(first) == len(columns) + 1 or starts[-1] != near.size:
         raise ValueError("blocks of another band")
     out = np.empty((place.size, place.size))
-    found = function(place.size, place, width, near, starts, columns, len(columns), out)
+    found = function(place.size, place, first, near, starts, columns, len(columns), out)
     return out if found == _DONE else None
 
 

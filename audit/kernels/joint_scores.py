@@ -21,14 +21,13 @@ _FACTS: Final = 27
 class BandArrays:
     """A banded S^+ by places; see `sfm_audit.audit.joint.banded.BandedInverse`.
 
-    place: (D,) of each column, those of the border from num_banded on.    width: of a block.    near: (m,), one block
-    behind the other; starts: (b + 1,); columns: (b,) of each block.    aside, pull: (D, g) A and B, by place.
-    scale: (D,) 1 / D, by column.
+    place: (D,) of each column, those of the border behind the last block.    first: (b + 1,) where each block begins and
+    the last one ends.    near: (m,), one block behind the other; starts: (b + 1,); columns: (b,) of each block.
+    aside, pull: (D, g) A and B, by place.    scale: (D,) 1 / D, by column.
     """
 
     place: IntArray
-    num_banded: int
-    width: int
+    first: IntArray
     near: FloatArray
     starts: IntArray
     columns: IntArray
@@ -100,8 +99,11 @@ class _Inverse(ctypes.Structure):
     _fields_ = (
         *(("size", ctypes.c_int64), ("width", ctypes.c_int64)),
         *((name, ctypes.c_void_p) for name in ("columns", "transform", "dense")),
-        *((name, ctypes.c_int64) for name in ("num_banded", "band_width", "num_blocks", "num_outer")),
-        *((name, ctypes.c_void_p) for name in ("place", "starts", "block_columns", "near", "aside", "pull", "scale")),
+        *((name, ctypes.c_int64) for name in ("num_banded", "num_blocks", "num_outer")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("place", "block", "first", "starts", "block_columns", "near", "aside", "pull", "scale")
+        ),
         *((name, ctypes.c_int64) for name in ("num_update", "num_extra")),
         *((name, ctypes.c_void_p) for name in ("update", "border", "corner", "extra_column")),
     )
@@ -159,11 +161,12 @@ class JointScores:
             ints(band.starts, num_blocks + 1),
             ints(band.columns, num_blocks),
         )
-        rows = np.diff(np.append(np.arange(num_blocks) * band.width, band.num_banded))
+        first = ints(band.first, num_blocks + 1)
+        rows, num_banded = np.diff(first), int(first[-1])
         is_sound = (
-            band.width >= 1
-            and 0 <= band.num_banded <= size
-            and num_blocks == -(-band.num_banded // band.width)
+            first[0] == 0
+            and num_banded <= size
+            and (rows >= 0).all()
             and (not size or (place.min() >= 0 and place.max() < size))
             and starts[0] == 0
             and starts[-1] == band.near.size
@@ -172,10 +175,11 @@ class JointScores:
         if not is_sound:
             raise ValueError("blocks of another band")
         num_outer = band.aside.shape[1]
-        self._inverse.num_banded, self._inverse.band_width = band.num_banded, band.width
-        self._inverse.num_blocks, self._inverse.num_outer = num_blocks, num_outer
+        self._inverse.num_banded, self._inverse.num_blocks, self._inverse.num_outer = num_banded, num_blocks, num_outer
         given = {
             "place": place,
+            "block": np.repeat(np.arange(num_blocks), rows),
+            "first": first,
             "starts": starts,
             "block_columns": columns,
             "near": doubles(band.near, band.near.shape),

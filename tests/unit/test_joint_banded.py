@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy import sparse
 
 from sfm_audit.audit.joint import inverse as joint_inverses
-from sfm_audit.audit.joint.banded import BandedInverse, band_of, banded_factor
+from sfm_audit.audit.joint.banded import BandedInverse, _starts, band_of, banded_factor
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
@@ -64,6 +65,8 @@ def test_a_street_is_a_band_and_a_room_is_none(street, reduced):
     row, column = (band.place[each] for each in reduced.matrix.nonzero())
     within = (row < band.num_banded) & (column < band.num_banded)
     assert np.abs(row[within] - column[within]).max() == band.width
+    assert np.abs(band.number(row[within]) - band.number(column[within])).max() == 1
+    assert np.diff(band.starts).max() <= band.width
     assert (band.order[band.place] == np.arange(len(band.order))).all()
     is_shared = len(street.model.cameras) == 1
     assert np.sort(band.order[band.num_banded :]).tolist() == (own_of(street, 0).tolist() if is_shared else [])
@@ -204,3 +207,15 @@ def test_a_border_that_is_not_positive_definite_makes_no_factor(street, reduced)
     matrix[own_of(street, 0), own_of(street, 0)] *= 1e-3
     gauge = np.zeros((len(matrix), 0))
     assert banded_factor(sparse.csr_array(matrix), band, gauge) is None
+
+
+def test_blocks_end_behind_what_the_one_before_couples_with():
+    """As short as that allows, but no shorter than half the width: places that couple with nothing do not make many."""
+    reach = np.array([2, 3, 3, 5, 6, 6, 9, 9, 9, 9, *range(10, 20)])
+    starts = _starts(reach, 3).tolist()
+    assert starts == [0, 3, 5, 7, 10, 12, 14, 16, 18, 20]
+    assert _starts(np.arange(9), 1).tolist() == list(range(10))
+    for here, following in pairwise(starts):
+        end = starts[min(starts.index(following) + 1, len(starts) - 1)]
+        assert reach[:following].max() < max(end, following)
+        assert following - here <= 3

@@ -168,8 +168,7 @@ def test_a_band_that_does_not_reach_is_left_to_numpy(asked):
         return
     main, observations = asked.system.base.inverse.main, asked.system.observations
     arrays = main.arrays()
-    width, size = arrays.width, arrays.num_banded
-    rows = np.minimum(width, size - width * np.arange(len(arrays.columns)))
+    rows = np.diff(arrays.first)
     near = np.concatenate([block[:, :own].ravel() for block, own in zip(main.near, rows.tolist(), strict=True)])
     short = dataclasses.replace(arrays, near=near, columns=rows, starts=np.cumsum([0, *rows**2]))
     given, behind = (asked.sums, observations.layout.columns, observations.transform), behind_of(asked.system)
@@ -177,8 +176,10 @@ def test_a_band_that_does_not_reach_is_left_to_numpy(asked):
     found = asked.many.scores(asked.images, [0] * len(asked.images))
     asked.many._kernel = JointScores(*given, arrays, **behind)
     assert any(each is None for each in found)
-    too_many = {"num_banded": len(arrays.place) + 1}
-    others = ({"width": width + 1}, {"place": arrays.place + 1}, {"near": near}, {"starts": arrays.starts + 1})
+    longer, later = arrays.first.copy(), arrays.first + 1
+    longer[-1] = len(arrays.place) + 1
+    too_many = {"first": longer}
+    others = ({"first": later}, {"place": arrays.place + 1}, {"near": near}, {"starts": arrays.starts + 1})
     for changes in (*others, too_many):
         with pytest.raises(ValueError, match="another band"):
             JointScores(*given, dataclasses.replace(arrays, **changes), **behind)

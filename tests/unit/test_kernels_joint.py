@@ -345,14 +345,17 @@ def test_entries_of_a_band_and_of_a_matrix():
     def entries(blocks, at=place):
         starts = np.cumsum([0, *(block.size for block in blocks)])
         columns = np.array([block.shape[1] for block in blocks])
-        return near_entries(at, 4, np.concatenate([block.ravel() for block in blocks]), starts, columns)
+        first = np.array([0, 4, 8, 10])[: len(blocks) + 1]
+        return near_entries(at, first, np.concatenate([block.ravel() for block in blocks]), starts, columns)
 
     np.testing.assert_array_equal(entries(blocks), full[np.ix_(place, place)])
     assert entries([blocks[0][:, :8], *blocks[1:]]) is None
     assert entries(blocks[:2]) is None
     assert entries(blocks, np.array([8, 11])) is None
     with pytest.raises(ValueError, match="another band"):
-        near_entries(place, 4, np.zeros(3), np.array([0, 4]), np.array([2]))
+        near_entries(place, np.array([0, 4]), np.zeros(3), np.array([0, 4]), np.array([2]))
+    with pytest.raises(ValueError, match="another band"):
+        near_entries(place, np.array([0, 1, 2]), np.zeros(4), np.array([0, 4]), np.array([2]))
     np.testing.assert_array_equal(dense_entries(full, place[::-1].copy()), full[np.ix_(place[::-1], place[::-1])])
     assert dense_entries(full, np.array([0, 10])) is None
     assert dense_entries(full[:, ::2], np.array([0])) is None

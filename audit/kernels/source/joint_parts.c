@@ -48,15 +48,17 @@ KERNEL int64_t joint_invert(int64_t num_points, double *matrices, double *determ
 
 /* out (s, s): entries of a banded symmetric matrix at sorted places (s), from the rows of its blocks.
  *
- * near: one block behind the other, each its rows at the columns of the block and of those behind it; starts (num_blocks + 1),
- * columns (num_blocks): where each begins, and how many columns it has. */
+ * first (num_blocks + 1): place where each block begins and the last one ends.    near: one block behind the other, each its
+ * rows at the columns of the block and of those behind it; starts (num_blocks + 1), columns (num_blocks): where each begins, and
+ * how many columns it has. */
 KERNEL int64_t joint_near_entries(
-    int64_t size, const int64_t *place, int64_t width, const double *near, const int64_t *starts, const int64_t *columns,
-    int64_t num_blocks,
-    double *out) {
+    int64_t size, const int64_t *place, const int64_t *first, const double *near, const int64_t *starts, const int64_t *columns,
+    int64_t num_blocks, double *out) {
+    int64_t block = 0;
     for (int64_t i = 0; i < size; i++) {
-        int64_t block = place[i] / width, origin = block * width;
-        if (place[i] < 0 || block >= num_blocks || place[size - 1] - origin >= columns[block]) return NEEDS_NUMPY;
+        while (block < num_blocks && place[i] >= first[block + 1]) block++;
+        if (place[i] < first[0] || block >= num_blocks || place[size - 1] - first[block] >= columns[block]) return NEEDS_NUMPY;
+        int64_t origin = first[block];
         const double *row = near + starts[block] + (place[i] - origin) * columns[block];
         if (row + columns[block] > near + starts[block + 1]) return NEEDS_NUMPY;
         for (int64_t j = i; j < size; j++) out[i * size + j] = row[place[j] - origin];

@@ -10,8 +10,9 @@ typedef struct {
     const int64_t *columns;    /* (I, width); `size` where an image has none */
     const double *transform;   /* (I, width, width) */
     const double *dense;       /* NULL: banded */
-    int64_t num_banded, band_width, num_blocks, num_outer; /* places from num_banded on are the border: Y is zero there */
-    const int64_t *place;      /* (size) of each column */
+    int64_t num_banded, num_blocks, num_outer; /* places from num_banded on are the border: Y is zero there */
+    const int64_t *place;                      /* (size) of each column */
+    const int64_t *block, *first;              /* (num_banded) of each place, (num_blocks + 1) place where each begins */
     const int64_t *starts, *block_columns;
     const double *near, *aside, *pull, *scale;
     /* what was included since: S^+ + U U^T, its border (size, num_extra) and corner (num_extra, num_extra) */
@@ -58,8 +59,8 @@ INLINE int entries_of(
         if (s->dense) {
             row = s->dense + place * s->size;
         } else {
-            int64_t block = place / s->band_width;
-            origin = block * s->band_width;
+            int64_t block = s->block[place];
+            origin = s->first[block];
             if (key[first_column + columns - 1].key - origin >= s->block_columns[block]) return 0;
             row = s->near + s->starts[block] + (place - origin) * s->block_columns[block];
         }
