@@ -129,7 +129,7 @@ def _of_block(
         lambda: misfits.append(joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)),
         lambda: of_sizes.extend(implied_of_sizes(system, steps)),
     )
-    misfit, implied = misfits[0], [*implied_of_cameras(system, steps, beside.found), *of_sizes]
+    misfit, implied = misfits[0], [*implied_of_cameras(system, steps, beside.found()), *of_sizes]
     poses = [unknown_pose()] * len(block.core) if with_poses else []
     if with_poses:
         for image, pose in zip(core, pose_covariances(system, core, list(covariance_of.values())), strict=True):

@@ -141,7 +141,7 @@ class BandedFactor:
         out = np.array(right, order="C")
         out[self.band.num_banded :] = 0.0
         blocks = list(self.band.blocks())
-        first = int(self.band.number(np.argmax(out.any(axis=1))))
+        first = int(self.band.number(np.array([np.argmax(out.any(axis=1))]))[0])
         for i in range(first, len(blocks)):
             if i > first:
                 out[blocks[i]] -= self.below[i - 1] @ out[blocks[i - 1]]

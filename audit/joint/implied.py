@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import partial
+from functools import cache, partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
 from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.camera_models import CameraModel
 from sfm_audit.loaders.model import CameraRecord
 
 MAX_SD_FOCAL_REL: Final = 0.003
@@ -83,7 +84,7 @@ class ImpliedBeside:
             for step in steps
             if len(step.image_idxs) == 1 and _can_lack(system, step)
         }
-        self.found: dict[int, list[ImpliedParameter]] = {}
+        self._taken: list[tuple[_Asked, CandidateScores]] = []
 
     def fields(
         self, image_idx: int, camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray
@@ -101,8 +102,15 @@ class ImpliedBeside:
     def take(self, image_idx: int, scores: CandidateScores) -> None:
         """Note what the columns would be."""
         asked = self._asked.get(image_idx)
-        if asked is not None and asked.camera_idx is not None:
-            self.found[asked.camera_idx] = _implied(self._system, asked, scores)
+        if asked is not None:
+            self._taken.append((asked, scores))
+
+    def found(self) -> dict[int, list[ImpliedParameter]]:
+        """Return what the parameters of each camera that was noted would be."""
+        asked = [each for each, _ in self._taken]
+        found = _implied(self._system, asked, [scores for _, scores in self._taken])
+        by_camera = zip((each.camera_idx for each in asked), found, strict=True)
+        return {camera: parameters for camera, parameters in by_camera if camera is not None}
 
 
 def implied_parameters(
@@ -205,16 +213,18 @@ def next_power(camera: CameraRecord) -> int:
     return next((k for k, term in enumerate(_RADIAL) if term not in terms), len(_RADIAL)) + 1
 
 
-def _lacking(camera: CameraRecord) -> list[tuple[Implied, tuple[str, ...], str]]:
-    terms = functions_of(camera.model).terms
+@cache
+def _lacking(model: CameraModel) -> dict[Implied, tuple[tuple[str, ...], str]]:
+    """Names and unit of what a camera model lacks or nobody refines."""
+    terms = functions_of(model).terms
     missing = [k for k, term in enumerate(_RADIAL) if term not in terms]
-    out: list[tuple[Implied, tuple[str, ...], str]] = [(Implied.PRINCIPAL_POINT, ("cx", "cy"), "px")]
+    out: dict[Implied, tuple[tuple[str, ...], str]] = {Implied.PRINCIPAL_POINT: (("cx", "cy"), "px")}
     if missing:
-        out.append((Implied.RADIAL, (f"k{missing[0] + 1}",), "1"))
+        out[Implied.RADIAL] = (f"k{missing[0] + 1}",), "1"
     if Term.ASPECT not in terms:
-        out.append((Implied.ASPECT, ("fx / fy - 1",), "1"))
+        out[Implied.ASPECT] = ("fx / fy - 1",), "1"
     if Term.TANGENTIAL not in terms:
-        out.append((Implied.TANGENTIAL, ("p1", "p2"), "1"))
+        out[Implied.TANGENTIAL] = ("p1", "p2"), "1"
     return out
 
 
@@ -225,63 +235,78 @@ def _of_images(system: JointSystem, asked: _Asked) -> list[ImpliedParameter]:
     if not is_camera or follows_the_lens(asked.camera.model):
         compiled = common_scores(system, images, asked.camera if is_camera else None, next_power(asked.camera))
     if compiled is not None:
-        return _implied(system, asked._replace(images=images), compiled)
+        return _implied(system, [asked._replace(images=images)], [compiled])[0]
     columns = _missing_fields if is_camera else _shift_fields
 
     def fields_of(image: int) -> FieldsInParts:
         return FieldsInParts(partial(columns, system, image))
 
-    return _implied(system, asked._replace(images=images), candidate_scores(system.base, images.tolist(), fields_of))
+    scores = candidate_scores(system.base, images.tolist(), fields_of)
+    return _implied(system, [asked._replace(images=images)], [scores])[0]
 
 
-def _implied(system: JointSystem, asked: _Asked, scores: CandidateScores) -> list[ImpliedParameter]:
-    """What each parameter would be, from the scores of all their columns."""
-    images, camera, camera_idx, sd_focal_rel = asked
-    sigma_px = float(np.median(system.observations.sigma_px[images]))
-    out = []
-    for parameter, names, unit in _lacking(camera):
-        if camera_idx is None and parameter is not Implied.PRINCIPAL_POINT:
+def _implied(
+    system: JointSystem, asked: Sequence[_Asked], scores: Sequence[CandidateScores]
+) -> list[list[ImpliedParameter]]:
+    """What the parameters of each that was asked for would be, from the scores of all their columns."""
+    all_sigma_px = system.observations.sigma_px
+    out: list[list[ImpliedParameter]] = [[] for _ in asked]
+    for parameter, columns in _COLUMNS.items():
+        is_shift = parameter is Implied.PRINCIPAL_POINT
+        chosen = [
+            k
+            for k, each in enumerate(asked)
+            if parameter in _lacking(each.camera.model) and (is_shift or each.camera_idx is not None)
+        ]
+        if not chosen:
             continue
-        step, sd, gain = _alone(scores, _COLUMNS[parameter])
-        known = sd_focal_rel <= MAX_SD_FOCAL_REL
-        large = np.abs(step) > MIN_SDS * sd
-        if parameter is Implied.PRINCIPAL_POINT:
-            large &= np.abs(step) > MIN_SHIFT_OVER_WIDTH * camera.width
-        px = sigma_px * math.sqrt(max(gain, 0.0) / scores.num_observations)
-        if parameter is not Implied.PRINCIPAL_POINT:
-            known = known and px > MIN_GAIN_PX
-        out.append(
-            ImpliedParameter(
-                parameter, camera_idx, images, names, unit, step, sd, sd_focal_rel, px, bool(known and large.any())
-            )
-        )
+        step, sd, gain = _alone([scores[k] for k in chosen], columns)
+        sigma_px = np.array([np.median(all_sigma_px[asked[k].images]) for k in chosen])
+        with np.errstate(invalid="ignore", over="ignore"):
+            px = sigma_px * np.sqrt(np.maximum(gain, 0.0) / [scores[k].num_observations for k in chosen])
+            large = np.abs(step) > MIN_SDS * sd
+            if is_shift:
+                large &= np.abs(step) > MIN_SHIFT_OVER_WIDTH * np.array([[asked[k].camera.width] for k in chosen])
+            known = np.array([asked[k].sd_focal_rel for k in chosen]) <= MAX_SD_FOCAL_REL
+            found = known & large.any(axis=1) & (is_shift | (px > MIN_GAIN_PX))
+        for number, k in enumerate(chosen):
+            images, camera, camera_idx, sd_focal_rel = asked[k]
+            names, unit = _lacking(camera.model)[parameter]
+            value, of_all = (step[number], sd[number], sd_focal_rel), (float(px[number]), bool(found[number]))
+            out[k].append(ImpliedParameter(parameter, camera_idx, images, names, unit, *value, *of_all))
     return out
 
 
-def _alone(scores: CandidateScores, own: slice) -> tuple[FloatArray, FloatArray, float]:
-    """Step K^+ u, its sd K^+ (sum G G^T) K^+, and the gain; NaN where base and points absorb a direction."""
-    scale = 1.0 / np.sqrt(scores.sq_length[own])
-    gram = scores.gram[own, own] * scale * scale[:, None]
-    if not np.isfinite(gram).all() or _smallest_eigenvalue(gram) <= _ABSORBED:
-        unknown = np.full(len(scale), np.nan)
-        return unknown, unknown, math.nan
-    inverse = _inverse(gram) * scale * scale[:, None]
-    step = inverse @ scores.score[own]
-    variance = ((inverse @ scores.meat[own, own]) * inverse).sum(axis=1)
-    return step, np.sqrt(np.maximum(variance, 0.0)), float(step @ scores.score[own])
+def _alone(scores: Sequence[CandidateScores], own: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Steps K^+ u (b, k), their sd K^+ (sum G G^T) K^+, and gains (b,); NaN where the base absorbs a direction."""
+    gram, meat = (np.stack([getattr(each, name)[own, own] for each in scores]) for name in ("gram", "meat"))
+    score, sq_length = (np.stack([getattr(each, name)[own] for each in scores]) for name in ("score", "sq_length"))
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(sq_length)
+        both = scale[:, :, None] * scale[:, None, :]
+        gram = gram * both
+        smallest, inverse = _smallest_eigenvalue(gram), _inverse(gram) * both
+        step = (inverse * score[:, None, :]).sum(axis=2)
+        moved = (inverse[:, :, :, None] * meat[:, None, :, :]).sum(axis=2)
+        sd = np.sqrt(np.maximum((moved * inverse).sum(axis=2), 0.0))
+        gain = (step * score).sum(axis=1)
+    unknown = ~(np.isfinite(gram).all(axis=(1, 2)) & (smallest > _ABSORBED))
+    step[unknown], sd[unknown], gain[unknown] = math.nan, math.nan, math.nan
+    return step, sd, gain
 
 
-def _smallest_eigenvalue(gram: FloatArray) -> float:
-    """Of a symmetric matrix (k, k), k = 1 or 2."""
-    if len(gram) == 1:
-        return float(gram[0, 0])
-    (a, b), (_, d) = gram.tolist()
-    return float(0.5 * (a + d) - math.hypot(0.5 * (a - d), b))
+def _smallest_eigenvalue(gram: FloatArray) -> FloatArray:
+    """Of symmetric matrices (b, k, k), k = 1 or 2."""
+    a, d = gram[:, 0, 0], gram[:, -1, -1]
+    if gram.shape[1] == 1:
+        return a
+    return np.asarray(0.5 * (a + d) - np.hypot(0.5 * (a - d), gram[:, 0, 1]))
 
 
 def _inverse(gram: FloatArray) -> FloatArray:
-    """Of a symmetric matrix (k, k), k = 1 or 2."""
-    if len(gram) == 1:
+    """Of symmetric matrices (b, k, k), k = 1 or 2."""
+    if gram.shape[1] == 1:
         return np.asarray(1.0 / gram)
-    (a, b), (_, d) = gram.tolist()
-    return np.asarray(np.array([[d, -b], [-b, a]]) / (a * d - b * b))
+    a, b, d = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    turned = np.stack([np.stack([d, -b], axis=1), np.stack([-b, a], axis=1)], axis=1)
+    return np.asarray(turned / (a * d - b * b)[:, None, None])

@@ -21,8 +21,8 @@ _FACTS: Final = 27
 class BandArrays:
     """A banded S^+ by places; see `sfm_audit.audit.joint.banded.BandedInverse`.
 
-    place: (D,) of each column, those of the border behind the last block.    first: (b + 1,) where each block begins and
-    the last one ends.    near: (m,), one block behind the other; starts: (b + 1,); columns: (b,) of each block.
+    place: (D,) of each column, those of the border behind the last block.    first: (b + 1,) where each block begins,
+    the end.    near: (m,), one block behind the other; starts: (b + 1,); columns: (b,) of each block.
     aside, pull: (D, g) A and B, by place.    scale: (D,) 1 / D, by column.
     """
 
