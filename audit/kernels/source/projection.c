@@ -352,8 +352,11 @@ typedef struct {
 INLINE void gather(Block *b, const Scene *s, int64_t image, int64_t first, int n) {
     const double *q = s->quaternions + 4 * image, *t = s->translations + 3 * image;
     const double w = q[0], qx = q[1], qy = q[2], qz = q[3];
+    const int64_t last = s->offsets[image + 1];
     Column x, y, z;
     b->n = n;
+    for (int64_t k = first + BLOCK; k < first + 2 * BLOCK && k < last; k++)
+        SOON(s->xyz_world + 3 * (s->point_idx[k] < 0 ? 0 : s->point_idx[k]));
     EACH(k, b) {
         const int64_t point = s->point_idx[first + k];
         const double *xyz = s->xyz_world + 3 * (point < 0 ? 0 : point);

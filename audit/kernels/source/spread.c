@@ -2,7 +2,7 @@
  * audit/camera_quality/coverage.py, expected_error.median_depth. All indices are in range: the Python module has looked. */
 #include "lanes.h"
 
-enum { CORNERS = 8 };
+enum { CORNERS = 8, AHEAD = 16 };
 static const double FLAT = 1e-13; /* of the squared size: what is smaller is rounding of points on one line */
 
 typedef struct {
@@ -227,6 +227,8 @@ KERNEL int64_t image_spread(int64_t num, const int64_t *images, const int64_t *o
         double *y = x + room, *z = y + room;
         for (int64_t i = 0; i < n; i++) {
             const double *seen = xy_px + 2 * observation_row[first + i], *point = xyz_world + 3 * point_idx[first + i];
+            if (i + AHEAD < n)
+                SOON(xyz_world + 3 * point_idx[first + i + AHEAD]);
             x[i] = seen[0];
             y[i] = seen[1];
             z[i] = depth_of(q, tz, point);

@@ -4,6 +4,16 @@
  * An observation is told by its row; residual, Jacobian and track of observation k stand n apart: xy[k], xy[n + k]. */
 
 enum { INVERSE = 0, STEP = 6, LENGTH = 9, POINT = 10 }; /* of a point: 3 x 3 upper triangle, vector, observations */
+enum { AHEAD = 16 };
+
+/* The points of an image lie all over memory: ask for one some observations before its turn. */
+INLINE void expect(int64_t n, const int64_t *point_idx, int64_t k, const double *points)
+{
+    if (k + AHEAD >= n)
+        return;
+    SOON(points + point_idx[k + AHEAD] * POINT);
+    SOON(points + point_idx[k + AHEAD] * POINT + POINT - 1); /* a point lies in two lines of the cache */
+}
 
 static inline int read_jacobian(int64_t n, const double *from, int64_t k, double j[6])
 {
@@ -23,6 +33,7 @@ KERNEL int64_t track_sums(int64_t n, const double *residuals, const double *jaco
                           const uint8_t *used, double *points)
 {
     for (int64_t k = 0; k < n; k++) {
+        expect(n, point_idx, k, points);
         if (!used[k])
             continue;
         double j[6], x = residuals[k], y = residuals[n + k];
@@ -85,6 +96,9 @@ KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *ja
                             double *whitened, uint8_t *verified, double *track_sq, double *removed)
 {
     for (int64_t k = 0; k < n; k++) {
+        expect(n, point_idx, k, points);
+        if (k + AHEAD < n)
+            SOON(track_sq + point_idx[k + AHEAD]);
         if (!used[k])
             continue;
         double j[6];
@@ -113,6 +127,11 @@ KERNEL int64_t track_others(int64_t n, const int64_t *point_idx, const uint8_t *
                             const uint8_t *verified, double *other_sq, int32_t *other_dof, int32_t *length)
 {
     for (int64_t k = 0; k < n; k++) {
+        if (k + AHEAD < n) {
+            SOON(track_sq + point_idx[k + AHEAD]);
+            SOON(points + point_idx[k + AHEAD] * POINT + LENGTH);
+            SOON(rank + point_idx[k + AHEAD]);
+        }
         if (!used[k])
             continue;
         const int64_t i = point_idx[k];

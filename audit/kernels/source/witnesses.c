@@ -15,10 +15,15 @@ enum { LAST = 1 << 30, AHEAD = 16 }; /* LAST: on the last image of each point, w
 static void turn_round(int64_t num_images, const int64_t *offsets, const int64_t *point_idx, const int64_t *starts,
                        int32_t *next, int32_t *seen_image, int32_t *place)
 {
+    const int64_t num = offsets[num_images];
     for (int64_t i = 0; i < num_images; i++)
         for (int64_t k = offsets[i]; k < offsets[i + 1]; k++) {
             const int64_t p = point_idx[k];
             const int32_t at = next[p];
+            if (k + 2 * AHEAD < num)
+                SOON(next + point_idx[k + 2 * AHEAD]);
+            if (k + AHEAD < num)
+                SOON(seen_image + next[point_idx[k + AHEAD]]);
             const int again = at && seen_image[at - 1] == i && at > starts[p];
             place[k] = again ? -1 : at;
             if (!again) {
@@ -40,7 +45,7 @@ static void count_shared(int64_t i, const int32_t *place, int64_t size, const in
     int64_t num_touched = 0;
     for (int64_t k = 0; k < size; k++) {
         if (k + AHEAD < size && place[k + AHEAD] >= 0)
-            __builtin_prefetch(seen_image + place[k + AHEAD]);
+            SOON(seen_image + place[k + AHEAD]);
         if (place[k] >= 0)
             for (int64_t o = place[k]; !(seen_image[o] & LAST);) {
                 const int32_t other = seen_image[++o] & ~LAST;
