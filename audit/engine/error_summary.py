@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
+from sfm_audit.audit.kernels.errors import error_summaries
 from sfm_audit.audit.table.arrow import Column
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -37,10 +38,25 @@ class ErrorSummary:
 def error_summary(residuals: ModelResiduals, image_idxs: range) -> ErrorSummary:
     """Sum up the reprojection errors of some images of a model."""
     offsets = residuals.offsets[image_idxs.start : image_idxs.stop + 1]
-    x, y = residuals.residuals_px[:, int(offsets[0]) : int(offsets[-1])]
+    counts = np.diff(offsets)
+    out = np.full((len(counts), len(_COLUMNS)), math.nan)
+    left = (counts > 0) & ~error_summaries(residuals.residuals_px, offsets, out)
+    if left.any():
+        out[left] = _summed_up(residuals.residuals_px, offsets[:-1][left], counts[left])
+    return ErrorSummary(out)
+
+
+def _summed_up(residuals_px: FloatArray, first: IntArray, counts: IntArray) -> FloatArray:
+    """Sum up (B, 5) images with inliers, whose columns begin with the first."""
+    ends = np.cumsum(counts)
+    starts = ends - counts
+    begin, end = int(first[0]), int(first[-1] + counts[-1])
+    if end - begin == ends[-1]:
+        x, y = residuals_px[:, begin:end]
+    else:  # they do not follow each other
+        x, y = residuals_px[:, np.repeat(first - starts, counts) + np.arange(ends[-1])]
     sq = x * x + y * y
-    starts, counts = offsets[:-1] - offsets[0], np.diff(offsets)
-    stacks = [_stack(starts, counts, size) for size in np.unique(counts[(counts > 0) & (counts <= _FEW)]).tolist()]
+    stacks = [_stack(starts, counts, size) for size in np.unique(counts[counts <= _FEW]).tolist()]
     many = [(row, slice(starts[row], starts[row] + counts[row])) for row in np.flatnonzero(counts > _FEW).tolist()]
     error = sq.copy()
     for _, columns in stacks:
@@ -54,10 +70,9 @@ def error_summary(residuals: ModelResiduals, image_idxs: range) -> ErrorSummary:
     for row, own in many:
         out[row, 0] = math.sqrt(np.add.reduce(sq[own]) / counts[row])
         out[row, 1] = np.add.reduce(error[own]) / counts[row]
-    asked = counts > 0
     for place, q in ((2, 0.5), (3, 0.95), (4, 1.0)):
-        out[asked, place] = _quantiles(error, starts[asked], counts[asked], q)
-    return ErrorSummary(out)
+        out[:, place] = _quantiles(error, starts, counts, q)
+    return out
 
 
 def _stack(starts: IntArray, counts: IntArray, size: int) -> tuple[IntArray, IntArray]:

@@ -39,6 +39,7 @@ from sfm_audit.audit.decision.decisions import Reasons
 from sfm_audit.audit.decision.diagnostics import Gains, SharedMisfit
 from sfm_audit.audit.decision.judged import Said as Kind
 from sfm_audit.audit.decision.measured import Measured
+from sfm_audit.audit.engine import error_summary as errors
 from sfm_audit.audit.engine.error_summary import error_summary
 from sfm_audit.audit.engine.images import audit_images
 from sfm_audit.audit.engine.known import measured_of
@@ -46,6 +47,8 @@ from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.engine.noise_columns import noise_columns
 from sfm_audit.audit.engine.tables import Said
 from sfm_audit.audit.inliers.residuals import longest_px
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.errors import error_summaries
 from sfm_audit.audit.simulate.defects import DefectKind
 from sfm_audit.audit.table import ModelLabels
 from sfm_audit.audit.table.witnesses import Witness, WitnessStatement
@@ -217,6 +220,51 @@ def test_errors_are_numpy_s(counts, seed, scale):
         wanted = np.sqrt((length**2).mean()), length.mean(), *np.quantile(length, [0.5, 0.95, 1.0])
         assert_allclose(row, wanted, rtol=1e-12, atol=1e-160)
     assert_allclose(found.longest_px, [longest_px(residuals_px[:, a:b]) for a, b in pairwise(residuals.offsets)])
+
+
+@pytest.mark.both_paths
+def test_errors_of_some_images_are_those_of_all():
+    counts, rng = [5, 0, 2000, 64, 65, 1, 0, 2, 300], np.random.default_rng(4)
+    residuals_px = np.round(rng.normal(size=(2, sum(counts))), 1)  # many are equal
+    residuals_px[:, 5:1300] = 0.0
+    residuals = SimpleNamespace(offsets=np.cumsum([0, *counts]), residuals_px=residuals_px)
+    every = error_summary(residuals, range(len(counts))).px
+    for start, stop in ((0, 1), (1, 2), (2, 5), (4, 9), (3, 3)):
+        assert_array_equal(error_summary(residuals, range(start, stop)).px, every[start:stop])
+    with numpy_only():
+        assert_allclose(every, error_summary(residuals, range(len(counts))).px, rtol=1e-12)
+    assert np.isnan(every[[1, 6]]).all()
+    assert (every[0] > 0).all()
+
+
+@pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels")
+@pytest.mark.parametrize("odd", [np.nan, np.inf, -np.inf, 1e300])
+def test_errors_without_an_order_are_left_to_numpy(odd):
+    residuals_px = np.random.default_rng(4).normal(size=(2, 40))
+    residuals_px[1, 17] = odd
+    out = np.zeros((4, 5))
+    assert error_summaries(residuals_px, np.array([0, 10, 10, 30, 40]), out).tolist() == [True, False, False, True]
+    assert (out[[1, 2]] == 0).all()
+    for wrong in ([0, 41], [-1, 3], [5, 3]):
+        with pytest.raises(IndexError, match="images beyond the 40 columns"):
+            error_summaries(residuals_px, np.array(wrong), np.zeros((1, 5)))
+    with pytest.raises(ValueError, match="room for"):
+        error_summaries(residuals_px, np.array([0, 40]), np.zeros((1, 4)))
+
+
+def test_images_that_are_left_need_not_follow_each_other(monkeypatch):
+    counts = [70, 3, 0, 100, 2]
+    residuals_px = np.random.default_rng(4).normal(size=(2, sum(counts)))
+    residuals = SimpleNamespace(offsets=np.cumsum([0, *counts]), residuals_px=residuals_px)
+    expected = error_summary(residuals, range(5)).px
+    told = np.array([True, False, False, True, False])
+
+    def some(_, __, out):
+        out[told] = expected[told]
+        return told
+
+    monkeypatch.setattr(errors, "error_summaries", some)
+    assert_allclose(error_summary(residuals, range(5)).px, expected, rtol=1e-12)
 
 
 def test_each_sentence_is_told_once_of_each_image():
