@@ -21,8 +21,8 @@ from sfm_audit.audit.kernels.joint import FIELDS, SCALAR, JointSums
 from sfm_audit.audit.kernels.joint_scores import Asked, IncludedArrays, JointScores, Scores, SeenArrays
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
-from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
-from sfm_audit.loaders.model import CameraRecord, ImageRecord, rotation_from_quat
+from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.model import CameraRecord, rotation_from_quat
 
 _X, _Y, _BOTH = 0, SCALAR, 2 * SCALAR  # where functions along x, along y and with both components begin
 _ROLLING, _NEXT = _BOTH + 4, _BOTH + 10
@@ -41,51 +41,8 @@ def sums_of_base(base: Base) -> JointSums | None:
     return joint_sums(base.observations, base.left_px, weights, inverses, included)
 
 
-def image_scores(
-    system: JointSystem, base: Base, sums: JointSums, image_idx: int, power: int
-) -> CandidateScores | None:
-    """Return the scores of an image's candidate fields; None where the numpy path has to be taken.
-
-    Parameters
-    ----------
-    sums : of the same base        power : of r^2 in the radial term of the missing parameters, 0 without these
-    """
-    observations = base.observations
-    image = system.model.image(image_idx)
-    camera = image.camera
-    if camera is None or not follows_the_lens(camera.model) or not sums.can(image_idx):
-        return None
-    fields = sums.fields(
-        image_idx, *_inputs(system, image_idx, camera), is_fisheye=is_fisheye(camera.model), power=power
-    )
-    if fields is None:
-        return None
-    tracks = sums.tracks(image_idx)
-    half = sums.first(image_idx, *fields, tracks)
-    if half is None:
-        return None
-    placed = _Placed(base, half.around)
-    right = placed.collected(half.right)
-    solution = base.inverse.within(placed.support, right)
-    sums.second(half, tracks, placed.spread(solution))
-    made_of = _fields(camera, power)
-    with np.errstate(over="ignore", invalid="ignore"):
-        gram = half.gram - right.T @ solution
-        meat = half.track_score.T @ half.track_score
-        if not (np.isfinite(gram).all() and np.isfinite(meat).all()):
-            return None  # numpy keeps what is not finite to the fields that it belongs to
-        squares = _squares(half.plain, half.dense_plain)
-        sq_length = ((squares @ made_of) * made_of).sum(axis=0)
-        if not (sq_length >= _LEFT_OF_TERMS * (squares.diagonal() @ made_of**2)).all():
-            return None  # functions that all but cancel, of an image that is a dot in the middle of nowhere
-        gram, meat = (made_of.T @ each @ made_of for each in (0.5 * (gram + gram.T), meat))
-    score = half.score @ made_of
-    of_fields = sq_length, gram, score, meat, tracks[1]
-    return CandidateScores(*of_fields, right, placed.support, solution, observations.num_of(image_idx), made_of)
-
-
 class ScoresOfMany:
-    """`image_scores` of many images in one call of a kernel.
+    """`candidate_scores` of an image each, many images in one call of a kernel.
 
     Of R and B they have the rows of the image's own columns alone: all that its tests ask for.
     """
@@ -101,7 +58,7 @@ class ScoresOfMany:
         self._kernel = JointScores(sums, *given, included=included, seen=seen_by(system))
 
     def scores(self, images: Sequence[int], powers: Sequence[int]) -> list[CandidateScores | None]:
-        """Return the scores of some images; None where `image_scores` has to be asked, or who comes after it.
+        """Return the scores of some images; None where the numpy path has to be taken.
 
         Parameters
         ----------
@@ -151,8 +108,9 @@ class ScoresOfMany:
         return out
 
 
-def scores_of_many(system: JointSystem, base: Base, sums: JointSums | None) -> ScoresOfMany | None:
-    """Return who asks about many images at once; None where each has to be asked by itself."""
+def scores_of_many(system: JointSystem, base: Base) -> ScoresOfMany | None:
+    """Return who asks about many images at once; None where each has to be asked by numpy."""
+    sums = sums_of_base(base)
     return ScoresOfMany(system, base, sums) if sums is not None and sums.repeats_follow else None
 
 
@@ -192,36 +150,6 @@ def _facts(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord
     lens = np.stack([fx, fy, 0.5 * width, 0.5 * height, 0.5 * np.maximum(width, height), height], axis=1)
     pose = rotation.reshape(-1, 9), table.translation_cam_from_world[images]
     return np.concatenate([*pose, lens, inverse.reshape(-1, 9)], axis=1)
-
-
-def _inputs(system: JointSystem, image_idx: int, camera: CameraRecord) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Facts (27,) of `JointSums.fields`, xyz_world (n, 3), predicted xy_px (n, 2)."""
-    observations, residuals = system.observations, system.residuals
-    source = observations.source[observations.rows(image_idx)]
-    image = system.model.image(image_idx)
-    focals = camera.params[list(camera.model.focal_idxs)]
-    width, height = camera.width, camera.height
-    size = [focals[0], focals[-1], 0.5 * width, 0.5 * height, 0.5 * max(width, height), height]
-    inverse = _world_from_cam(system.base, image, image_idx)
-    pose = image.rotation_cam_from_world.ravel(), image.translation_cam_from_world
-    facts = np.concatenate([*pose, size, inverse.ravel()])
-    xyz_world = system.model.points.xyz_world.take(residuals.point_idx[source], axis=0)
-    observed = system.model.observations.xy_px.take(residuals.observation_row[source], axis=0)
-    return facts, xyz_world, observed - residuals.residuals_px.take(source, axis=1).T
-
-
-def _world_from_cam(base: Base, image: ImageRecord, image_idx: int) -> FloatArray:
-    """(3, 3) inverse of an image's rotation."""
-    observations = base.observations
-    if not observations.layout.has_rigs:
-        return np.asarray(observations.transform[image_idx][POINT, POINT])
-    return np.asarray(np.linalg.pinv(image.rotation_cam_from_world))
-
-
-def _fields(camera: CameraRecord, power: int) -> FloatArray:
-    """(44, c) of which functions the candidate fields are made, then the missing parameters'."""
-    out = _fields_of([camera])[0]
-    return out if power else np.ascontiguousarray(out[:, :NUM_FIELDS])
 
 
 def _fields_of(cameras: Sequence[CameraRecord]) -> FloatArray:
@@ -269,68 +197,3 @@ def _squares(plain: FloatArray, dense_plain: FloatArray) -> FloatArray:
     out[..., :SCALAR, :SCALAR] = out[..., SCALAR:_BOTH, SCALAR:_BOTH] = plain
     out[..., _BOTH:, _BOTH:] = dense_plain
     return out
-
-
-class _Placed:
-    """Where the images around have their columns in the base.
-
-    support: (s,) columns of the base, ascending, those of included fields last.
-    """
-
-    def __init__(self, base: Base, around: IntArray) -> None:
-        layout = base.observations.layout
-        self._around, self._transform = around, base.observations.transform[around]
-        self._extra = [base.included[image].columns for image in around.tolist() if image in base.included]
-        self._is_extra = np.array([image in base.included for image in around.tolist()], dtype=bool)
-        columns = layout.columns[around]
-        self._real = (columns < layout.num_columns).ravel()
-        own = columns.ravel()[self._real]
-        distinct_own = distinct(own)
-        self._is_unique = distinct_own.size == own.size
-        self._place = np.searchsorted(distinct_own, own)
-        self._num_own, self._width = distinct_own.size, layout.width
-        order = sorted(range(len(self._extra)), key=lambda k: int(self._extra[k][0]))
-        self.support = np.concatenate([distinct_own, *(self._extra[k] for k in order)])
-        starts = np.cumsum([distinct_own.size, *(self._extra[k].size for k in order)]).tolist()
-        self._extra_place = {k: slice(starts[n], starts[n + 1]) for n, k in enumerate(order)}
-
-    def _rows(self) -> tuple[IntArray, list[slice]]:
-        """First rows of the design's columns of each image around (m,), and the rows of its included fields."""
-        sizes = np.full(len(self._around), self._width)
-        sizes[self._is_extra] += np.array([columns.size for columns in self._extra], dtype=np.int64)
-        starts = np.cumsum(sizes) - sizes
-        behind = starts[self._is_extra] + self._width
-        return starts, [
-            slice(start, start + columns.size) for start, columns in zip(behind.tolist(), self._extra, strict=True)
-        ]
-
-    def collected(self, right: FloatArray) -> FloatArray:
-        """(s, F) R of (rows, F) as `JointSums.first` has it."""
-        count = right.shape[1]
-        starts, behind = self._rows()
-        own = right if not self._extra else right[(starts[:, None] + np.arange(self._width)).ravel()]
-        turned = self._transform.transpose(0, 2, 1) @ own.reshape(-1, self._width, count)
-        rows = turned.reshape(-1, count)[self._real]
-        out = np.zeros((self.support.size, count))
-        if self._is_unique:
-            out[self._place] = rows
-        else:
-            np.add.at(out, self._place, rows)
-        for k, rows_of in enumerate(behind):
-            out[self._extra_place[k]] = right[rows_of]
-        return out
-
-    def spread(self, solution: FloatArray) -> FloatArray:
-        """(rows, F) T B of each image around, in the order of `JointSums.first`, of B (s, F)."""
-        count = solution.shape[1]
-        own = np.zeros((self._real.size, count))
-        own[self._real] = solution[self._place]
-        moved = (self._transform @ own.reshape(-1, self._width, count)).reshape(-1, count)
-        if not self._extra:
-            return moved
-        starts, behind = self._rows()
-        out = np.empty((len(moved) + sum(columns.size for columns in self._extra), count))
-        out[(starts[:, None] + np.arange(self._width)).ravel()] = moved
-        for k, rows_of in enumerate(behind):
-            out[rows_of] = solution[self._extra_place[k]]
-        return out

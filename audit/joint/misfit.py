@@ -14,7 +14,7 @@ from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
 from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_groups, untested
-from sfm_audit.audit.joint.image_scores import image_scores, scores_of_many, sums_of_base
+from sfm_audit.audit.joint.image_scores import scores_of_many
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
@@ -85,7 +85,7 @@ class Beside(Protocol):
         ...
 
     def power(self, image_idx: int) -> int:
-        """Of r^2 in the radial term among the fields, 0 where an image is not asked for any; see `image_scores`."""
+        """Of r^2 in the radial term among the fields, 0 where an image is not asked for any; see `ScoresOfMany`."""
         ...
 
     def take(self, image_idx: int, scores: CandidateScores) -> None:
@@ -143,8 +143,8 @@ class _Rounds:
         self, system: JointSystem, tested: BoolArray, *, alpha: float, tau_px: FloatArray, beside: Beside | None
     ) -> None:
         num_images = len(tested)
-        self._system, self._base, self._sums = system, system.base, sums_of_base(system.base)
-        self._many = scores_of_many(system, self._base, self._sums)
+        self._system, self._base = system, system.base
+        self._many = scores_of_many(system, self._base)
         self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
         self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
@@ -185,23 +185,16 @@ class _Rounds:
 
     def _scores_of(self, images: Sequence[int]) -> list[CandidateScores | None]:
         """Of each image, all that its tests ask for."""
-        if self._many is None:
-            return [self._scores(image) for image in images]
         powers = [0 if self._beside is None else self._beside.power(image) for image in images]
+        compiled = [None] * len(images) if self._many is None else self._many.scores(images, powers)
         out: list[CandidateScores | None] = []
-        for image, power, found in zip(images, powers, self._many.scores(images, powers), strict=True):
+        for image, power, found in zip(images, powers, compiled, strict=True):
             if found is not None and power and self._beside is not None:
                 self._beside.take(image, found.only(slice(NUM_FIELDS, None)))
-            out.append(self._scores(image) if found is None else found.only(slice(0, NUM_FIELDS)))
+            out.append(self._by_numpy(image) if found is None else found.only(slice(0, NUM_FIELDS)))
         return out
 
-    def _scores(self, image: int) -> CandidateScores | None:
-        power = 0 if self._beside is None else self._beside.power(image)
-        compiled = None if self._sums is None else image_scores(self._system, self._base, self._sums, image, power)
-        if compiled is not None:
-            if power and self._beside is not None:
-                self._beside.take(image, compiled.only(slice(NUM_FIELDS, None)))
-            return compiled.only(slice(0, NUM_FIELDS))
+    def _by_numpy(self, image: int) -> CandidateScores | None:
         fields: ImageFields | FieldsInParts
         if self._system.observations.num_of(image) <= AT_ONCE:
             fields = _fields_of(self._system, image, self._beside)
@@ -231,7 +224,7 @@ class _Rounds:
         candidates = []
         for image in np.flatnonzero(new).tolist():
             group = max(self._significant(image), key=lambda g: self.tests[image][g].px)
-            scores = self._scores(image)
+            [scores] = self._scores_of([image])
             if scores is not None:
                 own = GROUP_COLUMNS[group]
                 root = group_root(scores, own)
@@ -240,8 +233,7 @@ class _Rounds:
                 fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
                 candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
-        self._sums = sums_of_base(self._base)
-        self._many = scores_of_many(self._system, self._base, self._sums)
+        self._many = scores_of_many(self._system, self._base)
 
     def _touched(self, new: BoolArray) -> BoolArray:
         """(I,) images that share points with any of the new ones."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from sfm_audit.audit.kernels.checked import SmallIntArray, check_indices, doubles, first_views, ints, small_ints
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel, library
+from sfm_audit.audit.kernels.library import Doubles, Size, kernel, library
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 SCALAR: Final = 16
@@ -40,43 +40,6 @@ class _Model(ctypes.Structure):
 
 
 _ModelPointer: Final = ctypes.POINTER(_Model)
-
-
-class FirstHalf(NamedTuple):
-    """What `JointSums.first` says of an image; F = 44 fields.
-
-    around: (m,) images that see its points, ascending.    right: (rows, F) by image around: columns of the design, then
-    its included fields.    gram: (F, F).
-    plain: (16, 16) and dense_plain: (12, 12): w E^T E of scalars and of dense fields.
-    score: (F,).    track_score: (T, F).    views: what `JointSums.second` needs.
-    """
-
-    around: IntArray
-    right: FloatArray
-    gram: FloatArray
-    plain: FloatArray
-    dense_plain: FloatArray
-    score: FloatArray
-    track_score: FloatArray
-    views: tuple[SmallIntArray, IntArray, FloatArray]
-
-
-class _Space(NamedTuple):
-    """Arrays that `joint_first` writes to, in its order."""
-
-    view: SmallIntArray
-    own: SmallIntArray
-    around: IntArray
-    start: IntArray
-    num: IntArray
-    absorbing: FloatArray
-    right: FloatArray
-    gram: FloatArray
-    plain: FloatArray
-    dense_plain: FloatArray
-    score: FloatArray
-    track_score: FloatArray
-    scores: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,101 +172,6 @@ class JointSums:
         order = firsts[np.argsort(point[firsts], kind="stable")]
         track = number[order[np.searchsorted(point[order], point)]]
         return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
-
-    def fields(
-        self,
-        image_idx: int,
-        facts: FloatArray,
-        xyz_world: FloatArray,
-        xy_px: FloatArray,
-        *,
-        is_fisheye: bool,
-        power: int,
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Return the fields (n_i, 16) and (n_i, 2, 12) of an image; None where one of its points does not project.
-
-        Parameters
-        ----------
-        facts : (27,) R, t of cam_from_world, fx, fy, half width, half height, half of the larger one, height, R^-1
-        xyz_world, xy_px : (n_i, 3) and (n_i, 2) predicted        power : of r^2 in the next radial term, 0 for none
-        """
-        function = kernel("joint_fields", _ModelPointer, Size, Doubles, Doubles, Doubles, Size, Size, Doubles, Doubles)
-        n = self._num_rows(image_idx)
-        if function is None or xyz_world.shape != (n, 3) or xy_px.shape != (n, 2) or facts.shape != (27,):
-            return None
-        scalar, dense = np.empty((n, SCALAR)), np.empty((n, 2, DENSE))
-        status = function(
-            ctypes.byref(self._model), image_idx, facts, xyz_world, xy_px, int(is_fisheye), power, scalar, dense
-        )
-        return (scalar, dense) if status == DONE else None
-
-    def first(
-        self, image_idx: int, scalar: FloatArray, dense: FloatArray, tracks: tuple[SmallIntArray, int]
-    ) -> FirstHalf | None:
-        """First half of `candidate_scores`: what an image's fields are to the base, before S^+."""
-        function = kernel(
-            "joint_first",
-            *(
-                _ModelPointer,
-                Ints,
-                Size,
-                Doubles,
-                Doubles,
-                SmallInts,
-                Size,
-                Size,
-                SmallInts,
-                SmallInts,
-                Ints,
-                Ints,
-                Ints,
-            ),
-            *([Doubles] * 8),
-            Size,
-        )
-        n, views = self._num_rows(image_idx), int(self._num_views[image_idx])
-        track, num_tracks = tracks
-        if function is None or scalar.shape != (n, SCALAR) or dense.shape != (n, 2, DENSE) or track.shape != (n,):
-            return None
-        space = self._space(views, n, num_tracks)
-        status = function(
-            ctypes.byref(self._model),
-            *(np.zeros(self._num_images, dtype=np.int64), image_idx, scalar, dense, track, num_tracks),
-            *(len(space.right), space.view, space.own, space.around, space.start, space.num, space.absorbing),
-            *(space.right, space.gram, space.plain, space.dense_plain, space.score, space.track_score),
-            *(space.scores, space.scores.size),
-        )
-        if status != DONE:
-            return None
-        count, rows = space.num.tolist()
-        around, start = space.around[:count], space.start[: count + 1]
-        sums = space.gram, space.plain, space.dense_plain, space.score, space.track_score
-        return FirstHalf(around, space.right[:rows], *sums, (space.own, start, space.scores))
-
-    def _space(self, num_views: int, num_rows: int, num_tracks: int) -> _Space:
-        """Room for what `first` finds of an image."""
-        most = min(num_views, self._num_images)
-        max_rows, max_scores = most * self.width, num_views * self.width
-        if self._held["extra"].size > 1:
-            max_rows, max_scores = int(np.sort(self._widths)[-most:].sum()), num_views * int(self._widths.max())
-        view, own = np.empty((2, num_views), dtype=np.int32)
-        around, start, num = (np.empty(size, dtype=np.int64) for size in (most, most + 1, 2))
-        absorbing, right = np.empty((num_rows, 3, 2)), np.empty((max_rows, FIELDS))
-        gram, plain, dense_plain = (np.empty((size, size)) for size in (FIELDS, SCALAR, DENSE))
-        score, track_score, scores = np.empty(FIELDS), np.empty((num_tracks, FIELDS)), np.empty(max_scores)
-        found = gram, plain, dense_plain, score, track_score, scores
-        return _Space(view, own, around, start, num, absorbing, right, *found)
-
-    def second(self, first: FirstHalf, tracks: tuple[SmallIntArray, int], moved: FloatArray) -> None:
-        """Second half: subtract from ``first.track_score`` what the base does, ``moved`` (rows, F) = T B, in place."""
-        function = kernel(
-            "joint_second", _ModelPointer, Size, SmallInts, Ints, Ints, SmallInts, Doubles, Doubles, Doubles
-        )
-        if function is None or moved.shape != first.right.shape:
-            raise ValueError("the second half of other kernels or other fields")
-        own, start, scores = first.views
-        arguments = (own, first.around, start, tracks[0], scores, np.ascontiguousarray(moved), first.track_score)
-        function(ctypes.byref(self._model), len(first.around), *arguments)
 
     def off_points(
         self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True

@@ -50,7 +50,7 @@ class Rounds:
             ),
         )
         fields = SimpleNamespace(fields=np.zeros((1, 2, 42)), nuisance=None)
-        monkeypatch.setattr(joint_room, "sums_of_base", lambda _: None)
+        monkeypatch.setattr(joint_room, "scores_of_many", lambda *_: None)
         monkeypatch.setattr(joint_room, "_fields_of", lambda *_, **__: fields)
         monkeypatch.setattr(joint_room, "candidate_scores", lambda *_: "scores")
         monkeypatch.setattr(joint_room, "group_root", lambda _, own: np.eye(own.stop - own.start) * own.start)
