@@ -14,7 +14,7 @@ from sfm_audit.loaders.assembly.lookup import rows_of
 from sfm_audit.loaders.assembly.raw import RawPoints, offsets_of
 from sfm_audit.loaders.model import Finding, FindingCode, ObservationTable, SparseModel
 
-_CHUNK: Final = 1 << 18  # track elements at a time: what is needed beside the tables stays small
+_CHUNK: Final = 1 << 17  # track elements at a time: what is needed beside the tables stays small
 
 
 @dataclass(frozen=True, slots=True, eq=False)

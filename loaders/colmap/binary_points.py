@@ -25,7 +25,7 @@ _TRACK_LENGTH_AT: Final = 43
 _SIZE_BY_BYTE: Final = tuple(_POINT3D.itemsize + 8 * length for length in range(256))
 _FEW: Final = 1 << 4  # records between two looks at their lengths, where long tracks are about
 _MANY: Final = 1 << 12  # and where none was seen
-_PIECE_BYTES: Final = 1 << 23  # in memory at a time
+_PIECE_BYTES: Final = 1 << 21  # at a time: what is made of them stays in the cache, and takes few new pages
 _FIRST_BYTES: Final = 1 << 16  # of the first piece, in which most damage shows
 _MOST_AT_ONCE: Final = 1 << 22  # points or track elements for which memory is asked; it is touched when it is written
 
