@@ -56,10 +56,12 @@ def misfit(model: SparseModel) -> Callable[[], object]:
 
 
 def cameras(model: SparseModel) -> Callable[[], object]:
-    """Misfit tests of the first camera, pooled over its images."""
+    """Misfit tests of the first camera, pooled over its images, which were tested before."""
     residuals = model_residuals(model)
     images = np.flatnonzero(model.images.camera_idx == 0).tolist()
-    return lambda: camera_tests_of_sums(ModelSums(model, residuals), images)
+    tested = misfit_of_images(ModelSums(model, residuals), images)
+    known = {image: each.sums for image, each in tested.items() if each.sums is not None}
+    return lambda: camera_tests_of_sums(ModelSums(model, residuals, known), images)
 
 
 def spread(model: SparseModel) -> Callable[[], object]:

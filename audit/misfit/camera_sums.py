@@ -38,7 +38,8 @@ def camera_tests_of_sums(source: ModelSums, images: Sequence[int]) -> PooledTest
 
     Notes
     -----
-    Two passes over the observations. Memory: 3 kB for each image and 320 bytes for each of 65,536 tracks.
+    One pass over the observations, for the scores of tracks, and one before it of images whose sums are not known.
+    Memory: 3 kB for each image and 320 bytes for each of 65,536 tracks (of all with numpy alone).
     """
     num_observations = sum(source.num_of(image) for image in images)
     if not images or not all(map(source.can_sum, images)) or num_observations < _MIN_OBSERVATIONS * len(images):
