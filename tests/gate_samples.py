@@ -5,10 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from run_samples import STATE, make_ref, sample_table, settings
 
+from sfm_audit.reports.compare.comparison import RunSnapshot, compare
+from sfm_audit.reports.compare.gate import judge
+from sfm_audit.reports.compare.gate_policy import GatePolicy
 from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.store import RunStore
+
+_EMPTY = GatePolicy()
+_count = iter(range(10**6))
 
 NASTY = (
     "<script>alert('1')</script>.jpg",
@@ -68,8 +75,9 @@ def write_run(
     models: Mapping[str, Any] | None = None,
     failures: Any = (),
     config: Mapping[str, Any] | None = None,
+    cameras: Mapping[str, Any] | None = None,
 ) -> RunReader:
-    """Write a run: one model per entry, named dataset/scene/component or scene."""
+    """Write a run: one model per entry, named dataset/scene/component or scene, each with the same ``cameras``."""
     with RunStore(folder, settings(**(config or {}))) as store:
         for name, columns in scenes.items():
             dataset, scene_name, component = name.split("/") if name.count("/") == 2 else ("data", name, "0")
@@ -84,8 +92,29 @@ def write_run(
                 "models": sample_table(
                     "models", 1, num_images=[n], **count, **{k: [v] for k, v in same.items()}, **numbers
                 ),
-                "cameras": sample_table("cameras", 0),
+                "cameras": _cameras(same, cameras or {"camera_id": []}),
             }
             store.write(ref, STATE, tables, 0.1)
         store.finish(None, list(failures), 1.0)
     return RunReader.open(folder)
+
+
+def run(scenes: Mapping[str, Mapping[str, Any]], **options: Any) -> RunSnapshot:
+    """Write a run into the working folder and read it."""
+    return RunSnapshot.read(write_run(Path(f"RUN{next(_count)}"), scenes, **options))
+
+
+def failures(before: RunSnapshot | None, after: RunSnapshot, gate: GatePolicy = _EMPTY) -> set[str]:
+    """Return what fails: scope and name of the checks."""
+    comparison = compare(before, after) if before else None
+    return {f"{check.scope.name} {check.name}" for check in judge(gate, after, comparison) if not check.passed}
+
+
+def failed(before: RunSnapshot | None, after: RunSnapshot, gate: GatePolicy = _EMPTY) -> set[str]:
+    """Return the names of the checks that fail, bands by their key."""
+    return {name.split()[-1].removeprefix("band.") for name in failures(before, after, gate)}
+
+
+def _cameras(same: Mapping[str, Any], columns: Mapping[str, Any]) -> pa.Table:
+    n = len(columns["camera_id"])
+    return sample_table("cameras", n, **{k: [v] * n for k, v in same.items()}, **columns)

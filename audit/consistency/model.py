@@ -120,7 +120,7 @@ def model_consistency(
     else:
         findings += _images_disagree([image for image in images if image.inconsistent], num_judged)
     findings += _pixel_convention(images)
-    return ModelConsistency(tuple(images), tuple(findings), inconsistent, disagree or all_behind, all_behind)
+    return ModelConsistency(tuple(images), tuple(findings), inconsistent, disagree, all_behind)
 
 
 def _without_lone_scales(images: Sequence[ImageConsistency], num_judged: int) -> list[ImageConsistency]:

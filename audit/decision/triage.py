@@ -139,12 +139,11 @@ def _number(value: float | None) -> float:
 def _diagnosis(key: _Key, rows: Sequence[Row], cameras: Mapping[int, Row], model_path: str) -> Diagnosis:
     code, camera_id, advice = key
     words = DIAGNOSES[code]
-    severities = [row["severity"] for row in rows if row["severity"] is not None]
     camera = None if camera_id is None else cameras.get(camera_id)
     return Diagnosis(
         code,
         camera_id,
-        min(severities, key=lambda each: SEVERITY_ORDER.get(each, len(SEVERITY_ORDER)), default=None),
+        min((row["severity"] for row in rows), key=lambda each: SEVERITY_ORDER.get(each, len(SEVERITY_ORDER))),
         len(rows),
         (),
         f"{words.meaning}{_details(code, rows, camera)}",

@@ -10,6 +10,15 @@ DECISION: Final = tuple(f"unit/test_decision_{name}.py" for name in ("table", "r
 NUMBERS: Final = ("unit/test_decision_numbers.py",)
 LIMITS: Final = ("unit/test_consistency_limits.py", "unit/test_consistency.py")
 ROUNDS: Final = ("unit/test_joint_rounds.py",)
+GATE: Final = ("unit/test_gate.py::test_limits_of_a_scene_that_is_lost_are_not_met",)
+BANDS: Final = ("unit/test_gate_bands.py",)
+FINISHED: Final = tuple(
+    f"unit/test_store.py::test_{name}"
+    for name in (
+        "a_model_of_other_settings_is_unfinished_where_nothing_else_says_which_they_were",
+        "a_model_is_finished_with_observations_only_where_they_are_there",
+    )
+)
 NO_SCALE: Final = ("unit/test_keypoint_scale_noise.py::test_too_few_tracks_are_not_fitted",)
 
 _COLUMNS: Final = "unit/test_image_columns.py"
@@ -270,5 +279,47 @@ NAMED: Final = (
         "gain_px = min(self.own_step_px, self.plain_step_px)",
         "gain_px = self.own_step_px",
         NUMBERS,
+    ),
+    Named(
+        "images may move ten times as far between two runs",
+        "reports/compare/gate_policy.py",
+        "pose_centre: _Rise = 0.02",
+        "pose_centre: _Rise = 0.2",
+        BANDS,
+    ),
+    Named(
+        "a scene that is lost meets its limits",
+        "reports/compare/gate.py",
+        "own or _NOTHING",
+        "own or ScopeNumbers(1, 1, 0, 0, {}, 1.0, 1.0, 1.0)",
+        GATE,
+    ),
+    Named(
+        "an error that was seen before counts whole when it is found",
+        "reports/compare/comparison.py",
+        "seen=(misfit, pose, of_camera)",
+        "seen=(misfit * is_misfit, pose, of_camera)",
+        BANDS,
+    ),
+    Named(
+        "a model that was audited with other settings is finished",
+        "reports/run_folder/store.py",
+        "(part.version, part.config, part.labels) != (self._settings.version, self._config(), _labels(ref))",
+        "(part.version, part.labels) != (self._settings.version, _labels(ref))",
+        FINISHED,
+    ),
+    Named(
+        "a model without the observations that are asked for is finished",
+        "reports/run_folder/store.py",
+        "or not model.parts.keys() >= set(self._wanted)",
+        "",
+        FINISHED,
+    ),
+    Named(
+        "one model with limits is audited in the command's own process",
+        "audit/schedule/runner.py",
+        "elif len(plan) == 1 and plan[0].num_processes == 1 and not is_limited:",
+        "elif len(plan) == 1 and plan[0].num_processes == 1:",
+        ("unit/test_runner.py::test_a_model_with_limits_on_memory_or_time_is_watched_from_another_process",),
     ),
 )

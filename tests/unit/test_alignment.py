@@ -206,6 +206,15 @@ def test_each_band_can_fail(after, wanted):
 
 
 @pytest.mark.usefixtures("_folder")
+@pytest.mark.parametrize(("num_common", "num_compared"), [(2, []), (3, [3])])
+def test_two_models_are_compared_from_three_images_in_common(num_common, num_compared):
+    asked = []
+    one = snapshot("R0", ring(num_common))
+    compare(one, snapshot("R1", ring(5)), lambda keys, *_: asked.append(len(keys)))
+    assert asked == num_compared
+
+
+@pytest.mark.usefixtures("_folder")
 def test_poses_that_are_missing_or_damaged_are_left_out():
     poses = ring()
     damaged = {name: values.copy() for name, values in columns(poses).items()}

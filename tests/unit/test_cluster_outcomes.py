@@ -7,10 +7,12 @@ import pytest
 pytest.importorskip("distributed")
 
 from distributed import KilledWorker
+from run_samples import make_ref
 
-from sfm_audit.audit.schedule.cluster import _outcome
+from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.schedule.cluster import _audit_there, _outcome
 from sfm_audit.audit.schedule.errors import ClusterError
-from sfm_audit.audit.schedule.task import Failure, Unchanged
+from sfm_audit.audit.schedule.task import Failure, Task, Unchanged
 
 
 @pytest.mark.parametrize("is_connected", [True, False])
@@ -32,3 +34,10 @@ def test_a_cancelled_model_is_tried_again_while_there_is_a_cluster():
 def test_an_error_of_ours_keeps_its_kind():
     with pytest.raises(ZeroDivisionError):
         _outcome((ZeroDivisionError, ZeroDivisionError("x"), None), is_connected=True)
+
+
+def test_a_worker_of_another_version_audits_nothing():
+    asked = []
+    with pytest.raises(ClusterError, match=r"a Dask worker has sfm-audit .*, this machine 0\.0\.0; install the same"):
+        _audit_there(asked.append, Task(make_ref(), AuditConfig(), None), "0.0.0")
+    assert asked == []

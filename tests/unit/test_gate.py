@@ -1,24 +1,20 @@
 import math
 import tomllib
-from dataclasses import replace
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
-from gate_samples import NASTY, but, rejected, scene, without, write_run
+from gate_samples import NASTY, but, failed, failures, rejected, run, scene, without
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sfm_audit.reports.compare.comparison import RunSnapshot, compare
+from sfm_audit.reports.compare.comparison import compare
 from sfm_audit.reports.compare.gate import judge
-from sfm_audit.reports.compare.gate_policy import BAND_KEYS, Band, GatePolicy
-from sfm_audit.reports.compare.keys import ImageKey, Scope
+from sfm_audit.reports.compare.gate_policy import Band, GatePolicy
+from sfm_audit.reports.compare.keys import Scope
 from sfm_audit.reports.compare.learning import gate_toml, learn_bands
-from sfm_audit.reports.compare.motion import PoseChange, PoseFragment
 
 EMPTY = GatePolicy()
-_count = iter(range(10**6))
 
 
 @pytest.fixture(autouse=True)
@@ -27,21 +23,8 @@ def _folder(tmp_path, monkeypatch):
     monkeypatch.setattr("os.fsync", lambda _: None)
 
 
-def run(scenes, **options) -> RunSnapshot:
-    return RunSnapshot.read(write_run(Path(f"RUN{next(_count)}"), scenes, **options))
-
-
 def policy(text: str) -> GatePolicy:
     return GatePolicy.model_validate(tomllib.loads(text))
-
-
-def failures(before, after, gate=EMPTY) -> set[str]:
-    comparison = compare(before, after) if before else None
-    return {f"{check.scope.name} {check.name}" for check in judge(gate, after, comparison) if not check.passed}
-
-
-def failed(before, after, gate=EMPTY) -> set[str]:
-    return {name.split()[-1].removeprefix("band.") for name in failures(before, after, gate)}
 
 
 SOUND = {"a": scene(40), "b": scene(40)}
@@ -100,73 +83,6 @@ def test_what_is_within_the_bands_or_better_passes(after):
     assert failed(run(SOUND), run(after)) == set()
 
 
-def counts(before, *, accepted=1000, rejected=0, **others):
-    numbers = {"num_images": 1000, "num_accepted": accepted, "num_rejected": rejected}
-    return replace(before, **numbers, num_undetermined=1000 - accepted - rejected, **others)
-
-
-KEYS = tuple(ImageKey("data", "a", f"{i:04d}.jpg") for i in range(1000))
-NOTED = tuple((key, "") for key in KEYS)
-STILL = PoseChange(KEYS, 0.0, 0.0, (), (), 0.0)
-
-
-@pytest.mark.parametrize(
-    ("key", "within", "beyond", "changes"),
-    [
-        ("lost_scenes", 0, 1, lambda n, _: {"lost_scenes": ("data/b",) * n}),
-        ("lost_models", 0, 1, lambda n, _: {"lost_models": ("data/a/0",) * n}),
-        ("lost_images", 20, 21, lambda n, _: {"lost": NOTED[:n]}),
-        ("camera_model_changed", 0, 1, lambda n, _: {"remodelled": NOTED[:n]}),
-        ("newly_rejected", 50, 51, lambda n, _: {"newly_rejected": NOTED[:n]}),
-        ("share_accepted", 900, 899, lambda n, old: {"after": counts(old, accepted=n)}),
-        ("share_rejected", 50, 51, lambda n, old: {"after": counts(old, accepted=1000 - n, rejected=n)}),
-        ("share_rejected_by_reason", 50, 51, lambda n, old: {"after": counts(old, rejected_by_reason={"x": n})}),
-        ("median_sigma", 1.149, 1.151, lambda a, old: {"after": counts(old, sigma_px=a * old.sigma_px)}),
-        ("noise_s0", 1.149, 1.151, lambda a, old: {"after": counts(old, noise_s0_px=a * old.noise_s0_px)}),
-        (
-            *("recomputed_error", 1.149, 1.151),
-            lambda a, old: {"after": counts(old, recomputed_error_px=a * old.recomputed_error_px)},
-        ),
-        ("systematic_px", 0.25, 0.251, lambda a, _: {"grown_px": ((KEYS[0], a),)}),
-        ("fragments", 0, 1, lambda n, _: {"poses": (replace(STILL, fragments=(PoseFragment(KEYS, 5, 0.1),) * n),)}),
-        ("moved_images", 50, 51, lambda n, _: {"poses": (replace(STILL, moved=NOTED[:n]),)}),
-        ("pose_centre", 0.02, 0.0201, lambda a, _: {"poses": (replace(STILL, centre_error=a),)}),
-        ("pose_rotation_deg", 0.5, 0.501, lambda a, _: {"poses": (replace(STILL, rotation_deg=a),)}),
-        ("bending", 0.1, 0.101, lambda a, _: {"poses": (replace(STILL, bending=a),)}),
-    ],
-)
-def test_without_a_band_of_its_own_a_scene_may_change_as_far_as_the_documentation_says(key, within, beyond, changes):
-    one = run({"a": scene(40)})
-    same = compare(one, one)
-    [of_scene] = [change for change in same.changes if change.scope.kind == "scene"]
-    before = counts(of_scene.before)
-    found = {}
-    for amount in (within, beyond):
-        after = replace(of_scene, num_common=1000, **{"before": before, "after": before, **changes(amount, before)})
-        checks = judge(EMPTY, one, replace(same, changes=(after,)))
-        found[amount] = {check.name for check in checks if not check.passed}
-    assert found == {within: set(), beyond: {f"band.{key}"}}
-
-
-def test_every_band_has_a_case_on_both_sides():
-    [mark] = test_without_a_band_of_its_own_a_scene_may_change_as_far_as_the_documentation_says.pytestmark
-    assert [case[0] for case in mark.args[1]] == list(BAND_KEYS)
-
-
-def test_a_band_holds_the_share_that_it_names_whatever_the_rounding():
-    undetermined = [but(scene(10), *range(n), verdict="undetermined") for n in (6, 7)]
-    before, after = (run({"a": columns}) for columns in undetermined)
-    assert Band().share_accepted < 4 / 10 - 3 / 10
-    assert failed(before, after) == set()
-
-
-def test_noise_that_was_zero_may_not_grow():
-    nothing, some = (run(SOUND, models={"noise_s0_px": [s0]}) for s0 in (0.0, 1e-6))
-    assert failed(nothing, nothing) == set()
-    assert failed(nothing, some) == {"noise_s0"}
-    assert failed(some, nothing) == set()
-
-
 def test_limits_of_a_scene_that_is_lost_are_not_met():
     text = '[[scene]]\nmatch = "b"\nlimits = {min_images = 1, min_share_accepted = 0.1, max_median_sigma_px = 5}'
     assert failures(run(SOUND), run({"a": scene(40)}), policy(text)) >= {
@@ -198,6 +114,15 @@ def test_of_a_defect_that_was_there_before_only_the_growth_counts():
     new = but(scene(40), 7, verdict_misfit="rejected", misfit_px=1.2)
     assert failed(run({"a": old}), run({"a": new})) == set()
     assert failed(run({"a": new}), run({"a": but(new, 7, misfit_px=1.8)})) == {"systematic_px"}
+
+
+@pytest.mark.parametrize(
+    ("scenes", "told"), [({"b": scene(3)}, True), ({"a": scene(3)}, False), ({"a": scene(0)}, False)]
+)
+def test_two_runs_have_nothing_in_common_where_both_hold_images(scenes, told):
+    one, other = run({"a": scene(3)}), run(scenes)
+    assert compare(one, other).nothing_in_common == told
+    assert compare(other, one).nothing_in_common == told
 
 
 _scene = st.integers(0, 6).flatmap(

@@ -18,6 +18,7 @@ from sfm_audit.loaders.datasets.input_state import InputState
 from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
 from sfm_audit.reports.figures import ResidualError
 from sfm_audit.reports.run_folder import store as store_module
+from sfm_audit.reports.run_folder.parts import METADATA_KEY
 from sfm_audit.reports.run_folder.reader import RunReader
 from sfm_audit.reports.run_folder.record import read_run_json
 from sfm_audit.reports.run_folder.store import RunFailure, RunStore
@@ -54,6 +55,14 @@ def make_old(run: Path) -> None:
         del failure["kind"], failure["report"]
     (run / "run.json").write_text(json.dumps({**info, "inputs": inputs}, indent=1))
     (run / "manifest.jsonl").unlink()
+
+
+def after_another_input(path: Path) -> None:
+    """Make of a part the one of the same model before its files changed."""
+    table = pq.ParquetFile(path).read()
+    said = json.loads(table.schema.metadata[METADATA_KEY])
+    said["state"]["digest"] = "before"
+    pq.write_table(table.replace_schema_metadata({METADATA_KEY: json.dumps(said)}), path)
 
 
 def read_all(run: Path) -> list[dict]:
@@ -136,6 +145,14 @@ def test_a_run_json_that_counts_other_models_than_its_manifest_has_is_refused(ru
         RunReader.open(run)
 
 
+def test_a_complete_run_that_does_not_say_which_models_it_holds_is_refused(run):
+    info = json.loads((run / "run.json").read_text())
+    del info["manifest"]
+    (run / "run.json").write_text(json.dumps(info))
+    with pytest.raises(DamagedRunError, match=r"its run\.json does not say which models it holds"):
+        RunReader.open(run)
+
+
 def test_a_model_that_the_manifest_does_not_name_is_not_there(run):
     stranger = make_ref("data/c/sparse/0", scene="c")
     with RunStore(run.parent / "OTHER", settings()) as store:
@@ -213,6 +230,7 @@ def test_an_older_run_folder_is_read_with_a_note_and_audited_again(run, capsys):
         (cut, "is damaged"),
         (lambda path: shutil.copyfile(path.with_name(part(Path(), ref=B).name), path), "part of another model"),
         (lambda path: pq.write_table(pq.ParquetFile(path).read().slice(1), path), "1 rows, not 2"),
+        (after_another_input, "of another state of it"),
     ],
 )
 def test_of_an_older_run_folder_labels_and_rows_are_checked(run, change, words):

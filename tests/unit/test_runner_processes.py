@@ -26,7 +26,7 @@ from sfm_audit.audit.kernels.threads import over_ranges, threads
 from sfm_audit.audit.schedule.images import image_processes, read_shared, write_shared
 from sfm_audit.audit.schedule.lanes import Died, Lanes, RemoteTracebackError
 from sfm_audit.audit.schedule.processes import BYTES_WORTH_A_SHARE, in_processes, planned
-from sfm_audit.audit.schedule.task import Audited, Task, audit_one
+from sfm_audit.audit.schedule.task import Audited, Limits, Task, audit_one
 from sfm_audit.audit.simulate.dataset import DatasetSpec, scene_folder, write_dataset
 from sfm_audit.loaders import discover, open_model
 
@@ -58,6 +58,13 @@ def test_a_model_gets_its_share_of_the_processes(sizes, jobs, shares):
     total = max(1, sum(sizes))
     assert [task.num_threads for task in plan] == [max(1, jobs * task.ref.num_bytes // total) for task in plan]
     assert sum(share for share in shares if share > 1) <= jobs
+
+
+def test_a_limit_on_memory_holds_for_one_process():
+    limited = [replace(task, limits=Limits(memory_bytes=1)) for task in tasks_of((GB,))]
+    ((one,), (two,)) = planned(limited, 4), planned([replace(limited[0], limits=Limits(seconds=1.0))], 4)
+    assert (one.num_processes, one.num_threads) == (1, 4)
+    assert (two.num_processes, two.num_threads) == (4, 4)
 
 
 @pytest.fixture(scope="module")

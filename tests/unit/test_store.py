@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from run_damage import forge_manifest
 from run_samples import STATE, make_ref, part_times, sample_tables, settings
 
 from sfm_audit.audit.config import AuditConfig
 from sfm_audit.loaders.datasets.input_state import InputState
-from sfm_audit.reports.errors import OutputError, RunFolderError
+from sfm_audit.reports.errors import DamagedRunError, OutputError, RunFolderError
 from sfm_audit.reports.run_folder import disk
 from sfm_audit.reports.run_folder import store as store_module
 from sfm_audit.reports.run_folder.reader import RunReader
@@ -330,3 +332,36 @@ def test_the_mark_of_a_model_is_gone_from_the_disk_before_its_parts_are_written_
         store.write(A, InputState(1, "new", "new"), sample_tables(A), 0.1)
     assert flushed[0] == "models"
     assert flushed[-1] == "models"
+
+
+def part_of(folder: Path, table: str) -> Path:
+    return folder / table / f"part-{A.key}.parquet"
+
+
+def test_a_part_without_a_column_that_names_its_images_is_refused(tmp_path):
+    write_run(tmp_path, [A])
+    path = part_of(tmp_path, "images")
+    pq.write_table(pq.ParquetFile(path).read().drop_columns(["image_name"]), path)
+    forge_manifest(tmp_path)
+    with pytest.raises(DamagedRunError, match="it has no column image_name"):
+        list(RunReader.open(tmp_path).rows("images", ["scene", "image_name"]))
+
+
+@pytest.mark.parametrize("lacks", ["code", "text"])
+def test_a_finding_without_code_or_text_is_refused(tmp_path, lacks):
+    write_run(tmp_path, [A])
+    path = part_of(tmp_path, "models")
+    table = pq.ParquetFile(path).read()
+    field = table.schema.field("findings")
+    findings = pa.array([[{"code": "c", "count": 1, "text": "t", lacks: None}]], field.type)
+    pq.write_table(table.set_column(table.column_names.index("findings"), field, findings), path)
+    forge_manifest(tmp_path)
+    with pytest.raises(DamagedRunError, match="its column findings has a null"):
+        list(RunReader.open(tmp_path).rows("models", ["findings"]))
+
+
+def test_a_part_has_as_many_rows_as_its_line_says(tmp_path):
+    write_run(tmp_path, [A])
+    forge_manifest(tmp_path, lambda model: model["parts"]["images"].update(rows=3))
+    with pytest.raises(DamagedRunError, match="2 rows, not 3"):
+        list(RunReader.open(tmp_path).rows("images", ["scene"]))
