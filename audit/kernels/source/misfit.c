@@ -333,20 +333,23 @@ KERNEL int64_t sfm_misfit_sums(WINDOW, double *gram, double *on_y) {
     const int q = own_columns(facts);
     const int64_t size = q + NUM_FEATURES;
     void *to_free;
-    block_t *block = aligned_scratch(sizeof(block_t), &to_free);
-    if (!block || q > MAX_OWN) {
+    struct {
+        block_t block;
+        sums_t sums;
+    } *scratch = aligned_scratch(sizeof *scratch, &to_free);
+    if (!scratch || q > MAX_OWN) {
         free(to_free);
-        return block ? NEEDS_NUMPY : NO_MEMORY;
+        return scratch ? NEEDS_NUMPY : NO_MEMORY;
     }
+    block_t *block = &scratch->block;
     for (int64_t i = 0; i < num_images; ++i) {
         const image_t image = IMAGE(i);
-        sums_t sums;
-        memset(&sums, 0, sizeof sums);
+        memset(&scratch->sums, 0, sizeof scratch->sums);
         for (int64_t from = image.start; from < image.stop; from += SIZE) {
             evaluate(&model, &image, next_rows(&model, &image, from, block), block);
-            add_block(&sums, block, q);
+            add_block(&scratch->sums, block, q);
         }
-        write_sums(&sums, q, gram + i * size * size, on_y + i * size);
+        write_sums(&scratch->sums, q, gram + i * size * size, on_y + i * size);
     }
     free(to_free);
     return DONE;
@@ -562,23 +565,27 @@ KERNEL int64_t sfm_misfit_meat(WINDOW, const double *basis, const double *on_y, 
         if (rows[2 * i + 1] - rows[2 * i] > longest) longest = rows[2 * i + 1] - rows[2 * i];
     void *to_free;
     clusters_t clusters;
-    scratch_t *scratch = aligned_scratch(sizeof(scratch_t), &to_free);
+    struct {
+        scratch_t common;
+        meat_t meat;
+    } *room = aligned_scratch(sizeof *room, &to_free);
     const int status = make_clusters(longest, &clusters);
-    if (!scratch || status != DONE || q > MAX_OWN) {
+    if (!room || status != DONE || q > MAX_OWN) {
         free(to_free), free(clusters.memory);
         return q > MAX_OWN ? NEEDS_NUMPY : NO_MEMORY;
     }
+    scratch_t *scratch = &room->common;
+    meat_t *sums = &room->meat;
     for (int64_t i = 0; i < num_images; ++i) {
         const image_t image = IMAGE(i);
         const profile_t profile = {basis + i * q * q, on_y + i * q, q};
-        meat_t sums;
         num_clusters[i] = -1;
         if (find_clusters(&model, &image, &clusters) != DONE) continue;
-        memset(&sums, 0, sizeof sums);
+        memset(sums, 0, sizeof *sums);
         scratch->scores.largest_leverage = 0.0;
-        meat_of_singles(&model, &image, &profile, &clusters, scratch, &sums);
-        meat_of_clusters(&model, &image, &profile, &clusters, scratch, &sums);
-        write_meat(&sums, q, meat + i * size * size);
+        meat_of_singles(&model, &image, &profile, &clusters, scratch, sums);
+        meat_of_clusters(&model, &image, &profile, &clusters, scratch, sums);
+        write_meat(sums, q, meat + i * size * size);
         leverage[i] = scratch->scores.largest_leverage, num_clusters[i] = clusters.num_clusters;
     }
     free(to_free), free(clusters.memory);
