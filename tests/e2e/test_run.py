@@ -98,6 +98,7 @@ def test_a_path_that_is_not_there_costs_one_line_and_3(capsys):
     assert err.count("\n") == 1
     assert "nothing" in err
     assert len(pd.read_parquet("RUN/models")) == 1
+    assert main(["run", "data/0001", "-o", "RUN", "--quiet"]) == 0, "the folder is not bound to what held no model"
 
 
 def test_a_typo_leaves_no_folder_behind(capsys):
