@@ -32,6 +32,12 @@ class CommonGram(NamedTuple):
     is_seen: BoolArray
 
 
+class _Fields(ctypes.Structure):
+    """`common_fields` of joint_common.c."""
+
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("facts", "is_fisheye", "power", "made_of"))
+
+
 class CommonFields:
     """Asks about fields that some images have in common.
 
@@ -45,7 +51,6 @@ class CommonFields:
         self._sums, self._num_fields = sums, made_of.shape[1]
         held: list[object] = []
         self._seen = seen_points(seen, sums, held)
-        self._held = held
         count = len(asked.images)
         images = ints(asked.images, count)
         if count and not (images.min() >= 0 and images.max() < sums.num_images):
@@ -57,44 +62,45 @@ class CommonFields:
         lens = ints(asked.is_fisheye, len(facts)), ints(asked.power, len(facts))
         self._images, self._arrays = images, (facts, *lens, padded)
         given = (*(each.ctypes.data for each in self._arrays[:3]),) if has_facts else (None,) * 3
-        self._fields = *given, padded.ctypes.data
+        self._fields = _Fields(*given, padded.ctypes.data)
+        self._seen.held, self._fields.held = held, self._arrays  # whoever keeps the addresses keeps the arrays
         self._is_own = np.full(sums.num_images, -1, dtype=np.int64)
         self._is_own[images] = np.arange(count)
 
-    def _model(self) -> tuple[Any, Any]:
-        return ctypes.byref(self._sums.model), ctypes.byref(self._seen)
+    def _model(self) -> tuple[Any, Any, Any]:
+        return ctypes.byref(self._sums.model), ctypes.byref(self._seen), ctypes.byref(self._fields)
 
     def gram(self) -> CommonGram | None:
         """Return the sums of the fields among themselves; None for the numpy path."""
-        function = kernel("joint_common_gram", *_MODEL, Size, Size, Ints, *_FIELDS, *([Doubles] * 4), Bytes)
+        function = kernel("joint_common_gram", *_MODEL, Size, Size, Ints, *([Doubles] * 4), Bytes)
         if function is None:
             return None
         num_points, count = self._sums.num_points, self._num_fields
         absorbed, gram = np.empty((num_points, 3, COMMON)), np.empty((COMMON, COMMON))
         length, score = np.empty((2, COMMON))
         is_seen = np.empty(num_points, dtype=np.uint8)
-        given = num_points, len(self._images), self._images, *self._fields
+        given = num_points, len(self._images), self._images
         if function(*self._model(), *given, absorbed, gram, length, score, is_seen) != DONE:
             return None
         return CommonGram(absorbed, gram[:count, :count], length[:count], score[:count], is_seen.astype(bool))
 
     def right(self, absorbed: FloatArray) -> FloatArray | None:
         """(I, C, c) design^T w O E, by image; ``absorbed`` of `gram`."""
-        function = kernel("joint_common_right", *_MODEL, Ints, *_FIELDS, Doubles, Doubles)
+        function = kernel("joint_common_right", *_MODEL, Ints, Doubles, Doubles)
         out = np.empty((self._sums.num_images, self._sums.width, COMMON))
         given = doubles(absorbed, (self._sums.num_points, 3, COMMON))
-        if function is None or function(*self._model(), self._is_own, *self._fields, given, out) != DONE:
+        if function is None or function(*self._model(), self._is_own, given, out) != DONE:
             return None
         return out[:, :, : self._num_fields]
 
     def track_scores(self, moved: FloatArray) -> FloatArray | None:
         """(P, c) sum over the views of each point of w y~^T (E - N B); ``moved`` (I, C, c): T B of each image."""
-        function = kernel("joint_common_tracks", *_MODEL, Size, Ints, *_FIELDS, Doubles, Doubles)
+        function = kernel("joint_common_tracks", *_MODEL, Size, Ints, Doubles, Doubles)
         num_points = self._sums.num_points
         padded = np.zeros((self._sums.num_images, self._sums.width, COMMON))
         padded[:, :, : self._num_fields] = moved
         out = np.empty((num_points, COMMON))
-        given = num_points, self._is_own, *self._fields, padded
+        given = num_points, self._is_own, padded
         return (
             out[:, : self._num_fields]
             if function is not None and function(*self._model(), *given, out) == DONE
@@ -102,5 +108,4 @@ class CommonFields:
         )
 
 
-_MODEL: Final = (ctypes.c_void_p, ctypes.c_void_p)
-_FIELDS: Final = (ctypes.c_void_p,) * 4
+_MODEL: Final = (ctypes.c_void_p,) * 3

@@ -75,12 +75,10 @@ INLINE void fields_of(const common_fields *c, const field_space *space, int64_t 
  * Out: absorbed (P, 3, COMMON) V^-1 J^T w E; gram (COMMON, COMMON); length, score (COMMON): E^T w E, E^T w y~;
  * is_seen (P). */
 WIDE KERNEL int64_t joint_common_gram(
-    const joint_model *m, const seen_points *p, int64_t num_points, int64_t num, const int64_t *images, const double *facts,
-    const int64_t *is_fisheye, const int64_t *power, const double *made_of, double *absorbed, double *gram, double *length,
-    double *score, uint8_t *is_seen) {
-    common_fields c = {facts, is_fisheye, power, made_of};
+    const joint_model *m, const seen_points *p, const common_fields *c, int64_t num_points, int64_t num, const int64_t *images,
+    double *absorbed, double *gram, double *length, double *score, uint8_t *is_seen) {
     field_space space;
-    if (!has_room(m, &c, &space)) return NO_MEMORY;
+    if (!has_room(m, c, &space)) return NO_MEMORY;
     int64_t status = DONE;
     wide of_score[HALVES] = {{0}};
     memset(absorbed, 0, (size_t)(3 * COMMON * num_points) * sizeof *absorbed);
@@ -88,14 +86,14 @@ WIDE KERNEL int64_t joint_common_gram(
     memset(is_seen, 0, (size_t)num_points);
     for (int64_t k = 0; k < num && status == DONE; k++) {
         int64_t first = m->offsets[images[k]], n = m->offsets[images[k] + 1] - first;
-        status = look_at(m, p, &c, k, images[k], &space);
+        status = look_at(m, p, c, k, images[k], &space);
         for (int64_t i = 0; i < n && status == DONE; i++) {
             int64_t row = first + i, point = m->point_idx[row];
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
             double w = m->weight[row], *to = absorbed + 3 * COMMON * point;
             wide x[HALVES], y[HALVES];
             double plain_x[COMMON], plain_y[COMMON];
-            fields_of(&c, &space, i, x, y);
+            fields_of(c, &space, i, x, y);
             is_seen[point] = 1;
             for (int h = 0; h < HALVES; h++) {
                 STORE(plain_x + LANES * h) = x[h], STORE(plain_y + LANES * h) = y[h];
@@ -133,24 +131,23 @@ WIDE KERNEL int64_t joint_common_gram(
 
 /* right (I, width, COMMON): design^T w O E, by image; is_own (I): k of an image that has the fields, else -1. */
 WIDE KERNEL int64_t joint_common_right(
-    const joint_model *m, const seen_points *p, const int64_t *is_own, const double *facts, const int64_t *is_fisheye,
-    const int64_t *power, const double *made_of, const double *absorbed, double *right) {
-    common_fields c = {facts, is_fisheye, power, made_of};
+    const joint_model *m, const seen_points *p, const common_fields *c, const int64_t *is_own, const double *absorbed,
+    double *right) {
     field_space space;
     int64_t status = DONE, width = m->width;
-    if (!has_room(m, &c, &space)) return NO_MEMORY;
+    if (!has_room(m, c, &space)) return NO_MEMORY;
     memset(right, 0, (size_t)(m->num_images * width * COMMON) * sizeof *right);
     for (int64_t image = 0; image < m->num_images && status == DONE; image++) {
         int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
         double *to = right + image * width * COMMON;
-        if (is_own[image] >= 0) status = look_at(m, p, &c, is_own[image], image, &space);
+        if (is_own[image] >= 0) status = look_at(m, p, c, is_own[image], image, &space);
         for (int64_t i = 0; i < n && status == DONE; i++) {
             int64_t row = first + i;
             const double *dx = m->design + row * 2 * width, *dy = dx + width;
             const double *a = absorbed + 3 * COMMON * m->point_idx[row];
             double w = m->weight[row];
             wide x[HALVES] = {{0}}, y[HALVES] = {{0}};
-            if (is_own[image] >= 0) fields_of(&c, &space, i, x, y);
+            if (is_own[image] >= 0) fields_of(c, &space, i, x, y);
             for (int h = 0; h < HALVES; h++) {
                 for (int b = 0; b < 3; b++) {
                     wide step = LOAD(a + COMMON * b + LANES * h);
@@ -169,24 +166,23 @@ WIDE KERNEL int64_t joint_common_right(
 
 /* track_score (P, COMMON): sum over a point's views of w y~^T (E - N B), with moved (I, width, COMMON) T B of each image. */
 WIDE KERNEL int64_t joint_common_tracks(
-    const joint_model *m, const seen_points *p, int64_t num_points, const int64_t *is_own, const double *facts,
-    const int64_t *is_fisheye, const int64_t *power, const double *made_of, const double *moved, double *track_score) {
-    common_fields c = {facts, is_fisheye, power, made_of};
+    const joint_model *m, const seen_points *p, const common_fields *c, int64_t num_points, const int64_t *is_own,
+    const double *moved, double *track_score) {
     field_space space;
     int64_t status = DONE, width = m->width;
-    if (!has_room(m, &c, &space)) return NO_MEMORY;
+    if (!has_room(m, c, &space)) return NO_MEMORY;
     memset(track_score, 0, (size_t)(num_points * COMMON) * sizeof *track_score);
     for (int64_t image = 0; image < m->num_images && status == DONE; image++) {
         int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;
         const double *from = moved + image * width * COMMON;
-        if (is_own[image] >= 0) status = look_at(m, p, &c, is_own[image], image, &space);
+        if (is_own[image] >= 0) status = look_at(m, p, c, is_own[image], image, &space);
         for (int64_t i = 0; i < n && status == DONE; i++) {
             int64_t row = first + i;
             const double *dx = m->design + row * 2 * width, *dy = dx + width;
             double *to = track_score + COMMON * m->point_idx[row];
             double rx = m->weight[row] * m->left[2 * row], ry = m->weight[row] * m->left[2 * row + 1];
             wide x[HALVES] = {{0}}, y[HALVES] = {{0}}, sum[HALVES];
-            if (is_own[image] >= 0) fields_of(&c, &space, i, x, y);
+            if (is_own[image] >= 0) fields_of(c, &space, i, x, y);
             for (int h = 0; h < HALVES; h++) sum[h] = rx * x[h] + ry * y[h];
             for (int64_t d = 0; d < width; d++) {
                 double along = rx * dx[d] + ry * dy[d];
