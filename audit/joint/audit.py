@@ -12,6 +12,7 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
 from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_of_cameras, implied_of_sizes
+from sfm_audit.audit.joint.layout import median_of
 from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
 from sfm_audit.audit.joint.observations import usable_images
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
@@ -112,7 +113,7 @@ def _of_block(
     steps = own_parameters(system, covariances_of_members)
     covariance_of = {image: covariances_of_members[image] for image in core}
     out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
-    material = [step for step in steps if step.is_material(float(np.median(tau_px[step.image_idxs])))]
+    material = [step for step in steps if step.is_material(median_of(tau_px, step.image_idxs))]
     for step in material:
         out[step.image_idxs] = True
     settled = {step.camera_idx: step for step in implied_again(system, material)}

@@ -16,6 +16,7 @@ from sfm_audit.audit.cameras.models import functions_of
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.common_scores import common_scores
+from sfm_audit.audit.joint.layout import median_of
 from sfm_audit.audit.joint.own import CameraStep
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields, follows_the_lens
@@ -249,7 +250,7 @@ def _implied(
     system: JointSystem, asked: Sequence[_Asked], scores: Sequence[CandidateScores]
 ) -> list[list[ImpliedParameter]]:
     """What the parameters of each that was asked for would be, from the scores of all their columns."""
-    all_sigma_px = system.observations.sigma_px
+    of_all = np.array([median_of(system.observations.sigma_px, each.images) for each in asked])
     out: list[list[ImpliedParameter]] = [[] for _ in asked]
     for parameter, columns in _COLUMNS.items():
         is_shift = parameter is Implied.PRINCIPAL_POINT
@@ -261,7 +262,7 @@ def _implied(
         if not chosen:
             continue
         step, sd, gain = _alone([scores[k] for k in chosen], columns)
-        sigma_px = np.array([np.median(all_sigma_px[asked[k].images]) for k in chosen])
+        sigma_px = of_all[chosen]
         with np.errstate(invalid="ignore", over="ignore"):
             px = sigma_px * np.sqrt(np.maximum(gain, 0.0) / [scores[k].num_observations for k in chosen])
             large = np.abs(step) > MIN_SDS * sd
@@ -272,8 +273,8 @@ def _implied(
         for number, k in enumerate(chosen):
             images, camera, camera_idx, sd_focal_rel = asked[k]
             names, unit = _lacking(camera.model)[parameter]
-            value, of_all = (step[number], sd[number], sd_focal_rel), (float(px[number]), bool(found[number]))
-            out[k].append(ImpliedParameter(parameter, camera_idx, images, names, unit, *value, *of_all))
+            value, told = (step[number], sd[number], sd_focal_rel), (float(px[number]), bool(found[number]))
+            out[k].append(ImpliedParameter(parameter, camera_idx, images, names, unit, *value, *told))
     return out
 
 

@@ -14,6 +14,11 @@ from sfm_audit.loaders.model import SparseModel
 NUM_POSE: Final = 6
 
 
+def median_of(values: FloatArray, images: IntArray) -> float:
+    """Return the median over some images of values (I,); most cameras have one image, and numpy's median is slow."""
+    return float(values[images[0]] if images.size == 1 else np.median(values[images]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
     """Columns of the joint system: six per frame, and the own parameters of each camera.

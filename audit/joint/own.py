@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.layout import NUM_POSE, median_of
 from sfm_audit.audit.joint.system import JointSystem
 from sfm_audit.audit.table.thresholds import MIN_OWN_STEP_SDS
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -124,7 +124,7 @@ def _camera_step(
     columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
     images = layout.images_of_camera(camera_idx)
     n = int(np.diff(observations.offsets)[images].sum())
-    sigma_px = float(np.median(observations.sigma_px[images]))
+    sigma_px = median_of(observations.sigma_px, images)
     step, plain = system.base.step[columns], system.plain_step[columns]
     sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     focals = [params.index(i) for i in camera.model.focal_idxs]

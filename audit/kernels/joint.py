@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm_audit.audit.kernels.checked import SmallIntArray, check_indices, doubles, first_views, ints, small_ints
 from sfm_audit.audit.kernels.library import Doubles, Size, kernel, library
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 SCALAR: Final = 16
 """Scalar functions of a field along one axis: 1, the fourteen monomials, padding."""
@@ -100,9 +100,17 @@ class JointSums:
         self._model = _Model(num_images, self.width, *(held[name].ctypes.data for name in _ARRAYS))
         self._model.held = held  # whoever keeps the addresses keeps the arrays
         self._num_images = num_images
-        views = np.diff(held["point_offsets"])[held["point_idx"]]
-        self._is_first = first_views(held)
-        self._num_views = np.diff(np.concatenate([[0], np.cumsum(views)])[held["offsets"]])
+
+    @cached_property
+    def _is_first(self) -> BoolArray:
+        """(n,) whether no earlier row of the image shows the same point."""
+        return first_views(self._held)
+
+    @cached_property
+    def _num_views(self) -> IntArray:
+        """(I,) views of the points of each image."""
+        views = np.diff(self._held["point_offsets"])[self._held["point_idx"]]
+        return np.asarray(np.diff(np.concatenate([[0], np.cumsum(views)])[self._held["offsets"]]))
 
     @property
     def num_images(self) -> int:
