@@ -80,15 +80,17 @@ def _compiled_systems(
         return None
     own_columns, others, columns = _columns_of(layout, images, [each.pairs for each in found])
     grams, rights = (np.concatenate([each[k] for each in found]) for k in (1, 2))
-    systems = []
-    for k, inverse in enumerate(inverses):
+
+    def system(k: int) -> ReducedSystem:
         right, before = np.zeros((2, layout.num_columns + 1))
         np.add.at(right, own_columns, rights[:, k])
         np.add.at(before, own_columns, np.einsum("iaa->ia", grams[:, k]))
         slabs = np.concatenate([each.pairs.slabs[k] for each in found])
         matrix = _symmetric(layout.num_columns, others, columns, slabs)
-        systems.append(ReducedSystem(inverse, matrix, right[:-1], before[:-1]))
-    return systems[0], systems[1]
+        return ReducedSystem(inverses[k], matrix, right[:-1], before[:-1])
+
+    robust, plain = over_ranges(lambda k, _: system(k), len(inverses), range_weight=1.0)
+    return robust, plain
 
 
 def _of_images(observations: JointObservations, images: IntArray, compiled: Callable[[IntArray], T | None]) -> list[T]:
