@@ -248,7 +248,7 @@ NAMED: Final = (
     Named(
         "the noise of a camera's images is their largest",
         "audit/joint/own.py",
-        "float(np.median(observations.sigma_px[images]))",
+        "median_of(observations.sigma_px, images)",
         "float(np.max(observations.sigma_px[images]))",
         ("unit/test_joint_own_noise.py",),
     ),

@@ -129,6 +129,11 @@ def test_a_further_null_direction_is_found_in_a_band_too(street, reduced):
     assert isinstance(found.main, BandedInverse)
     assert found.num_null == 1
     assert {int(first), int(second)} <= set(np.flatnonzero(found.unidentified).tolist())
+    unit = np.sqrt(matrix.diagonal())
+    expected = np.linalg.pinv(matrix.toarray() / unit / unit[:, None], rcond=1e-11, hermitian=True)
+    columns = street.observations.layout.columns[30]
+    both = unit[columns] * unit[columns][:, None]
+    assert_allclose(found.main.block(columns) * both, expected[np.ix_(columns, columns)], atol=1e-7)
 
 
 def test_covariances_are_the_sandwich_by_numpy(street, reduced, scale):
@@ -155,8 +160,12 @@ def test_blocks_of_many_images_are_those_of_one(street, dense):
     columns = street.observations.layout.columns[:, :8]
     band = street.base.inverse.main.factor.band
     far = np.concatenate([band.order[:4], band.order[band.num_banded - 4 : band.num_banded]])[None]
+    assert all(street.base.inverse.main._is_near(each) for each in columns)
+    edge = np.array(
+        [[band.order[band.starts[1] - 1], band.order[band.starts[4] + k], *band.order[4:10]] for k in (-1, 0)]
+    )
     assert not street.base.inverse.main._is_near(far[0])
-    asked = np.concatenate([columns, far])
+    asked = np.concatenate([columns, far, edge])  # the last column that is at hand, and the first that is not
     for main in (street.base.inverse.main, dense.main):
         for found, each in zip(main.blocks(asked), asked, strict=True):
             expected = main.block(each)
@@ -219,3 +228,13 @@ def test_blocks_end_behind_what_the_one_before_couples_with():
         end = starts[min(starts.index(following) + 1, len(starts) - 1)]
         assert reach[:following].max() < max(end, following)
         assert following - here <= 3
+
+
+def test_a_column_that_reaches_far_is_taken_out_of_a_band_that_would_do_without():
+    """A band either way, but a narrower one with a border."""
+    places = np.arange(400)
+    near = np.abs(places[:, None] - places) <= 4
+    near[200, 150:251] = near[150:251, 200] = True
+    band = band_of(sparse.csr_array(near.astype(np.float64)))
+    assert band.order[band.num_banded :].tolist() == [200]
+    assert band.width == 4
