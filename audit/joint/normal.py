@@ -89,7 +89,8 @@ def _compiled_systems(
         matrix = _symmetric(layout.num_columns, others, columns, slabs)
         return ReducedSystem(inverses[k], matrix, right[:-1], before[:-1])
 
-    robust, plain = over_ranges(lambda k, _: system(k), len(inverses), range_weight=1.0)
+    parts = over_ranges(lambda k, end: [system(each) for each in range(k, end)], len(inverses), range_weight=1.0)
+    robust, plain = (one for part in parts for one in part)
     return robust, plain
 
 

@@ -100,12 +100,12 @@ def test_threads_change_nothing(scene, number, monkeypatch):
     alone = audited(scene)
     began = []
 
-    def in_small_ranges(function, num_images, weights=None, _range_weight=None):
+    def in_small_ranges(function, num_images, weights=None, range_weight=1000.0):
         def noted(start, stop):
             began.append(threading.current_thread().name)
             return function(start, stop)
 
-        return over_ranges(noted, num_images, weights, 1000.0)
+        return over_ranges(noted, num_images, weights, min(range_weight, 1000.0))
 
     for module in (spreading, misfit, normal, design, consistency, projection):
         monkeypatch.setattr(module, "over_ranges", in_small_ranges)
