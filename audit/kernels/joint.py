@@ -209,19 +209,6 @@ class JointSums:
             raise ValueError("steps of other images, or no kernels")
         function(ctypes.byref(self._model), moved, left_px)
 
-    def along_design(self, values_px: FloatArray) -> FloatArray:
-        """(I, C) w design^T values (n, 2), summed over each image's rows."""
-        function = kernel("joint_along_design", _ModelPointer, Doubles, Doubles)
-        if function is None or values_px.shape != self._held["left"].shape:
-            raise ValueError("values of other observations, or no kernels")
-        out = np.empty((self._num_images, self.width))
-        function(ctypes.byref(self._model), np.ascontiguousarray(values_px), out)
-        return out
-
-    def _num_rows(self, image_idx: int) -> int:
-        first, last = self._held["offsets"][image_idx : image_idx + 2].tolist()
-        return int(last - first)
-
 
 def has_joint_kernels() -> bool:
     """Whether the sums come from the compiled library."""

@@ -342,17 +342,6 @@ KERNEL int64_t joint_subtract_step(const joint_model *m, const double *moved, do
     return DONE;
 }
 
-/* out (I, width): sum over an image's rows of w design^T values (n, 2). */
-KERNEL int64_t joint_along_design(const joint_model *m, const double *values, double *out) {
-    memset(out, 0, (size_t)(m->num_images * m->width) * sizeof *out);
-    for (int64_t row = 0; row < m->offsets[m->num_images]; row++) {
-        const double *dx = m->design + row * 2 * m->width, *dy = dx + m->width;
-        double *to = out + m->width * m->image_idx[row], x = m->weight[row] * values[2 * row], y = m->weight[row] * values[2 * row + 1];
-        for (int64_t c = 0; c < m->width; c++) to[c] += dx[c] * x + dy[c] * y;
-    }
-    return DONE;
-}
-
 /* The fields of an image: scalar (n, SCALAR) 1, x, y, x^2, .. y^4 of the predicted point, 0; dense (n, 2, DENSE): radial,
  * tangential, derivatives in the pose times the row coordinate, the next radial term, 0 (audit/misfit/fields.py, audit/joint).
  *
