@@ -67,11 +67,14 @@ def load_and_update(folder: str) -> None:
 def audit(folder: str) -> None:
     """Audit stage by stage; the joint step late, so that memory without it can be told."""
     clock = _Laps()
-    from sfm_audit.audit.engine.model import ModelAuditor  # noqa: PLC0415
+    from sfm_audit.audit.schedule.imports import importing_audits  # noqa: PLC0415
     from sfm_audit.audit.schedule.memory import keep_freed  # noqa: PLC0415
-    from sfm_audit.loaders import open_model  # noqa: PLC0415
 
-    keep_freed()  # as the command line does
+    keep_freed()  # as the command line does, and the next
+    with importing_audits():
+        from sfm_audit.audit.engine.model import ModelAuditor  # noqa: PLC0415
+        from sfm_audit.loaders import open_model  # noqa: PLC0415
+
     clock.lap("imports")
     auditor = ModelAuditor(open_model(folder))
     clock.lap("read, check")

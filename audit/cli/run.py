@@ -21,7 +21,7 @@ from sfm_audit.audit.cli.finding import (
 from sfm_audit.audit.cli.settings import read_config
 from sfm_audit.audit.cli.terminal import print_page, write_stdout
 from sfm_audit.audit.config import AuditConfig, NoiseName, PointsName
-from sfm_audit.audit.schedule.garbage import importing
+from sfm_audit.audit.schedule.imports import importing_audits
 from sfm_audit.audit.table.words import POLICIES
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ def command(  # one parameter per option
         if options["as_json"]:
             _print_json(out, exit_code)
         return exit_code
-    with importing():  # half a second: --help and a wrong option, config or PATH need not wait for it
+    with importing_audits():  # half a second: --help and a wrong option, config or PATH need not wait for it
         from sfm_audit.audit.cli.auditing import RunRequest, print_summary, run_audit  # noqa: PLC0415
 
     request = RunRequest(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.cameras import project, project_with_jacobians
 from sfm_audit.audit.consistency.affine import median_of, robust_weights
@@ -47,6 +46,8 @@ def lengths_after_pose_step(
     by it (`pose_not_optimal` says so), while several would let every camera of a model whose points have another scale
     walk to where its own points fit, and hide that the parts do not belong together.
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most models have no image that needs it
+
     with np.errstate(all="ignore"):
         jacobian = project_with_jacobians(camera.model, camera.params, xyz_cam, with_params=False).d_xy_d_cam
         columns = pose_columns(jacobian.transpose(1, 2, 0), xyz_cam)

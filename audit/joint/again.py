@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 from scipy.sparse import linalg as sparse_linalg
-from scipy.spatial.transform import Rotation
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.joint.layout import NUM_POSE
@@ -77,6 +76,8 @@ class _State:
 
     def moved(self) -> SparseModel:
         """Return the model after the step."""
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most models need no second step
+
         layout, model = self.observations.layout, self.model
         quat, translation = model.images.quat_cam_from_world_wxyz.copy(), model.images.translation_cam_from_world.copy()
         used = np.flatnonzero(layout.has_columns)

@@ -22,7 +22,8 @@ from typing import Any, Final, Generic, Literal, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from sfm_audit.audit.schedule.garbage import importing, leaving
+from sfm_audit.audit.schedule.garbage import leaving
+from sfm_audit.audit.schedule.imports import importing_audits
 from sfm_audit.audit.schedule.memory import give_back, keep_freed
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
@@ -236,7 +237,7 @@ def _serve(connection: Connection) -> None:
     keep_freed()
     while True:
         try:
-            with importing():  # the first call's function is imported when it arrives
+            with importing_audits():  # the first call's function is imported when it arrives
                 function, arguments = connection.recv()
         except (EOFError, OSError):
             leaving()

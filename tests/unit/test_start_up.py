@@ -45,6 +45,7 @@ def test_an_audit_imports_only_what_it_uses():
         "rich.console",
         "tqdm",
         "scipy.optimize",
+        "scipy.spatial",
         "scipy.stats",
         "pandas",
         "pycolmap",
@@ -55,3 +56,18 @@ def test_an_audit_imports_only_what_it_uses():
     ask = f"import sys, sfm_audit.audit.cli.auditing; print(*[name for name in {others} if name in sys.modules])"
     ended = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     assert not ended.stdout.split()
+
+
+def test_scipy_copies_no_subpackage_of_numpy_that_nobody_uses():
+    ask = (
+        "import sys, numpy\n"
+        "from sfm_audit.audit.schedule.imports import importing_audits\n"
+        "before = list(numpy.__all__), set(dir(numpy))\n"
+        "with importing_audits():\n"
+        "    import scipy.special, scipy.linalg, sfm_audit.audit.cli.auditing\n"
+        "print(*[name for name in ('f2py', 'ma', 'polynomial', 'testing') if f'numpy.{name}' in sys.modules])\n"
+        "from numpy import *\n"
+        "print((list(numpy.__all__), set(dir(numpy))) == before, 'numpy.ma' in sys.modules, ma.masked is not None)"
+    )
+    ended = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines() == ["", "True True True"]
