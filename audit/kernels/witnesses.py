@@ -101,7 +101,7 @@ def should_see(
         if num <= capacity:
             break
         capacity = num
-    return points[:num], images[:num], sees[:num].view(np.bool_), np.ascontiguousarray(rays[:num].T), distances[:num]
+    return points[:num], images[:num], sees[:num].view(np.bool_), rays[:num].T, distances[:num]
 
 
 def pair_sums(
@@ -118,7 +118,7 @@ def pair_sums(
     Parameters
     ----------
     sizes : numbers of points and images        point, image, sees : (m,) as of `should_see.ShouldSee`, image by image
-    of_views : their rays (3, m), and logarithms of their distances (m,)
+    of_views : their rays (3, m), best those of an image beside each other, and logarithms of their distances (m,)
     """
     types = (Size, Size, Size, Ints, Ints, Bytes, Doubles, Doubles, SmallInts, Size, Ints, Ints, Doubles, Doubles)
     run = kernel("witness_pair_sums", *types)
@@ -130,7 +130,7 @@ def pair_sums(
     first, second = (np.empty(capacity, dtype=np.int64) for _ in range(2))
     sums, own_rest = np.empty((capacity, _NUM_SUMS)), np.zeros(num_images)
     number = np.zeros((num_images, num_images), dtype=np.int32)
-    given = _ints(point), _ints(image), sees.view(np.uint8), np.ascontiguousarray(ray), log_distance
+    given = _ints(point), _ints(image), sees.view(np.uint8), np.ascontiguousarray(ray.T), log_distance
     num = run(num_images, num_points, len(point), *given, number, capacity, first, second, sums, own_rest)
     if num < 0:
         return None

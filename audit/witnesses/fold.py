@@ -129,6 +129,7 @@ def find_fold(seen: ShouldSee) -> Fold | None:
     if seen.num_points < MIN_POINTS:
         return None
     sums = pair_sums(seen)
+    del seen  # of a large model as much as the matrix of its pairs
     pairs = _close_pairs(sums)
     found = [judged(split, pairs) for split in _splits(sums)]
     told = [fold for fold in found if fold is not None]
@@ -184,7 +185,7 @@ def _splits(sums: PairSums) -> Iterator[IntArray]:
     size = np.sqrt(np.maximum(sums.own_rest, np.finfo(float).tiny))
     together = np.zeros((len(size), len(size)))
     together[sums.first, sums.second] = sums.rest / (size[sums.first] * size[sums.second])
-    together += together.T
+    together[sums.second, sums.first] = together[sums.first, sums.second]
     yield from sides(*_leading(together))
 
 

@@ -338,7 +338,7 @@ static void by_point(int64_t num_points, int64_t num_rows, const int64_t *point,
         order[offsets[point[row]]++] = row;
 }
 
-/* Compares the images that should see each point. point, image, sees, ray (3, m), log_distance: (m,), image by image.
+/* Compares the images that should see each point. point, image, sees, ray (m, 3), log_distance: (m,), image by image.
  * number: (I, I) zeros, in which pairs are numbered from 1 as they are met.
  * first, second: (capacity,), sums: (capacity, 6), own_rest: (I,) zeros. Returns the number of pairs; negative without
  * memory, or if the images are not in order. */
@@ -360,7 +360,7 @@ KERNEL int64_t witness_pair_sums(int64_t num_images, int64_t num_points, int64_t
             if (k && image[row] <= views[k - 1].image)
                 num = -1;
             else
-                views[k] = (View){image[row], sees[row], {ray[row], ray[num_rows + row], ray[2 * num_rows + row]},
+                views[k] = (View){image[row], sees[row], {ray[3 * row], ray[3 * row + 1], ray[3 * row + 2]},
                                   log_distance[row], 0.0};
             rate += sees[row];
         }
