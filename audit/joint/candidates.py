@@ -131,7 +131,7 @@ def _points_of(base: Base, images: Sequence[int]) -> IntArray:
     """The distinct points that the images see."""
     observations = base.observations
     if len(images) == 1:
-        return distinct(observations.point_idx[observations.rows(images[0])])
+        return distinct(observations.point_idx[observations.rows(images[0])]).astype(np.int64)
     seen = np.zeros(observations.num_points, dtype=bool)
     for image in images:
         seen[observations.point_idx[observations.rows(image)]] = True

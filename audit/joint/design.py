@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,8 +14,9 @@ from sfm_audit.audit.joint.layout import NUM_POSE, Layout
 from sfm_audit.audit.kernels import kernels_in_use
 from sfm_audit.audit.kernels.joint_parts import DesignInputs, fill_design
 from sfm_audit.audit.kernels.threads import over_ranges
-from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel, rotation_from_quat
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.camera_models import CameraModel
+from sfm_audit.loaders.model import CameraRecord, SparseModel, rotation_from_quat
 
 AT_ONCE: Final = 2**15
 """Observations of an image up to which its derivatives are kept, and all its fields in memory at the same time."""
@@ -75,45 +77,60 @@ class Design:
     def _made(self, image_idx: int, chosen: slice | IntArray) -> FloatArray:
         source = self.source[self._rows(image_idx)][chosen]
         out = np.zeros((source.size, 2, self.layout.width))
-        _fill(out, self.model, self.residuals, self.layout, _Rows(image_idx, source, None))
+        ends = np.array([0, source.size], dtype=np.int64)
+        _fill(out, self.model, self.residuals, self.layout, _Rows(np.array([image_idx]), ends, source))
         return out
 
 
 def make_design(
     model: SparseModel, residuals: ModelResiduals, layout: Layout, source: IntArray, offsets: IntArray
 ) -> Design:
-    """Differentiate image by image."""
+    """Differentiate, some images at a time."""
     counts = np.diff(offsets)
     is_kept = counts <= AT_ONCE
     ends = np.cumsum(np.where(is_kept, counts, 0))
     first = np.where(is_kept, ends - counts, -1).astype(np.int64)
     kept = np.zeros((int(ends[-1]) if ends.size else 0, 2, layout.width))
     images = np.flatnonzero(is_kept & (counts > 0))
-    inverses = np.linalg.pinv(rotation_from_quat(model.images.quat_cam_from_world_wxyz[images]))  # all at once
+    of_kept = source if is_kept.all() else source[np.repeat(is_kept, counts)]
 
     def fill(start: int, stop: int) -> None:
-        for image, inverse in zip(images[start:stop].tolist(), inverses[start:stop], strict=True):
-            own = source[int(offsets[image]) : int(offsets[image + 1])]
-            _fill(kept[first[image] : first[image] + own.size], model, residuals, layout, _Rows(image, own, inverse))
+        some = images[start:stop]
+        rows = slice(int(first[some[0]]), int(ends[some[-1]]))
+        starts = np.append(first[some], rows.stop) - rows.start
+        _fill(kept[rows], model, residuals, layout, _Rows(some, starts, of_kept[rows]))
 
     over_ranges(fill, images.size, counts[images])
     return Design(model, residuals, layout, source, offsets, kept, first)
 
 
 class _Rows(NamedTuple):
-    """Chosen observations (n,) of an image, columns of ModelResiduals; (3, 3) inverse of its rotation if at hand."""
+    """Chosen observations (n,) of images (k,), columns of ModelResiduals; where each image's begin, (k + 1,)."""
 
-    image_idx: int
+    images: IntArray
+    offsets: IntArray
     source: IntArray
-    world_from_cam: FloatArray | None
+
+    def of(self, k: int) -> _Rows:
+        """Return those of one of the images."""
+        start, stop = self.offsets[k : k + 2].tolist()
+        return _Rows(self.images[k : k + 1], np.array([0, stop - start]), self.source[start:stop])
 
 
 def _fill(own: FloatArray, model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows) -> None:
-    """Write the rows of an image's chosen observations."""
-    image, source, _ = rows
-    inputs = _inputs(model, residuals, layout, rows)
-    if inputs is not None and fill_design(own, inputs):
-        return
+    """Write the rows of chosen observations, which are zero."""
+    done = np.zeros(len(rows.images), dtype=bool)
+    if kernels_in_use():
+        inputs, done = _inputs(model, residuals, layout, rows)
+        done &= fill_design(own, inputs)
+    for k in np.flatnonzero(~done).tolist():
+        part = slice(int(rows.offsets[k]), int(rows.offsets[k + 1]))
+        _fill_image(own[part], model, residuals, layout, rows.of(k))
+
+
+def _fill_image(own: FloatArray, model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows) -> None:
+    """The same of one image, by numpy."""
+    image, source = int(rows.images[0]), rows.source
     projected = image_inliers(model, residuals, image, source - residuals.offsets[image]).projected
     own[:, :, : POINT.start] = projected.pose[: POINT.start].transpose(2, 1, 0)
     own[:, :, POINT] = _point_columns(residuals, source)
@@ -124,32 +141,49 @@ def _fill(own: FloatArray, model: SparseModel, residuals: ModelResiduals, layout
         own[~np.isfinite(own)] = 0.0
 
 
-def _inputs(model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows) -> DesignInputs | None:
-    """What the compiled design is made of; None for numpy: panoramas have columns that are not finite."""
-    image_idx, source, world_from_cam = rows
-    image = model.image(image_idx)
-    camera = image.camera
-    if not kernels_in_use() or camera is None or camera.model.is_spherical:
-        return None
-    rotation = image.rotation_cam_from_world
-    focals, centre, extras = camera.model.focal_idxs, camera.model.principal_point_idxs, camera.model.extra_idxs
-    kinds = {focals[0]: 0} if len(focals) == 1 else {focals[0]: 1, focals[-1]: 2}
-    kinds |= {param: 3 + e for e, param in enumerate(extras)}
-    params = layout.own_param_idxs[int(layout.camera_idx[image_idx])]
-    lens = camera.params[[focals[0], focals[-1], centre[0], centre[-1]]]
-    inverse = np.linalg.pinv(rotation) if world_from_cam is None else world_from_cam
-    facts = [rotation.ravel(), inverse.ravel(), image.translation_cam_from_world, lens]
-    observed = model.observations.xy_px.take(residuals.observation_row[source], axis=0)
-    return DesignInputs(
-        np.concatenate(facts),
-        np.array([kinds[param] for param in params], dtype=np.int64),
+def _inputs(
+    model: SparseModel, residuals: ModelResiduals, layout: Layout, rows: _Rows
+) -> tuple[DesignInputs, BoolArray]:
+    """What the compiled design is made of, and (k,) for whom it holds; panoramas have columns that are not finite."""
+    images, source = rows.images, rows.source
+    rotation = rotation_from_quat(model.images.quat_cam_from_world_wxyz[images])
+    lens = np.ones((images.size, 4))
+    kinds = np.full((images.size, layout.width - NUM_POSE), -1, dtype=np.int64)
+    holds = np.zeros(images.size, dtype=bool)
+    for k, camera_idx in enumerate(model.images.camera_idx[images].tolist()):
+        camera = model.camera(camera_idx) if camera_idx >= 0 else None
+        if camera is not None and not camera.model.is_spherical:
+            lens[k], holds[k] = _lens(camera), True
+            params = layout.own_param_idxs[int(layout.camera_idx[images[k]])]
+            kinds[k, : len(params)] = [_kinds(camera.model)[param] for param in params]
+    flat = rotation.reshape(-1, 9), np.linalg.pinv(rotation).reshape(-1, 9)
+    inputs = DesignInputs(
+        rows.offsets,
+        np.hstack([*flat, model.images.translation_cam_from_world[images], lens]),
+        kinds,
         residuals.point_jacobian,
+        residuals.residuals_px,
         source,
-        int(residuals.offsets[image_idx]),
+        residuals.offsets[images],
         model.points.xyz_world.take(residuals.point_idx[source], axis=0),
-        observed - residuals.residuals_px.take(source, axis=1).T,
-        residuals.d_extra[image_idx],
+        model.observations.xy_px.take(residuals.observation_row[source], axis=0),
+        [residuals.d_extra[image] for image in images.tolist()],
     )
+    return inputs, holds
+
+
+def _lens(camera: CameraRecord) -> FloatArray:
+    """(4,) fx, fy, cx, cy."""
+    focals, centre = camera.model.focal_idxs, camera.model.principal_point_idxs
+    return camera.params[[focals[0], focals[-1], centre[0], centre[-1]]]
+
+
+@cache
+def _kinds(model: CameraModel) -> dict[int, int]:
+    """Which derivative each parameter has: see `DesignInputs`."""
+    focals = model.focal_idxs
+    kinds = {focals[0]: 0} if len(focals) == 1 else {focals[0]: 1, focals[-1]: 2}
+    return kinds | {param: 3 + e for e, param in enumerate(model.extra_idxs)}
 
 
 def _point_columns(residuals: ModelResiduals, source: IntArray) -> FloatArray:

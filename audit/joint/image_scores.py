@@ -37,8 +37,7 @@ SHIFT[_X, 0] = SHIFT[_Y, 1] = 1.0
 def sums_of_base(base: Base) -> JointSums | None:
     """Return the compiled sums over a base; None where numpy is to be used."""
     included = {image: extra.fields for image, extra in base.included.items()}
-    weights, inverses = (base.observations.weight,), (base.point_inverse,)
-    return joint_sums(base.observations, base.left_px, weights, inverses, included)
+    return joint_sums(base.observations, base.left_px, base.observations.weight, base.point_inverse, included)
 
 
 class ScoresOfMany:

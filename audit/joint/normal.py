@@ -13,9 +13,9 @@ from sfm_audit.audit.joint.design import AT_ONCE
 from sfm_audit.audit.joint.layout import Layout
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
-from sfm_audit.audit.joint.sums import joint_sums
+from sfm_audit.audit.joint.sums import has_joint_sums, joint_sums
 from sfm_audit.audit.kernels.joint import JointSums
-from sfm_audit.audit.kernels.joint_normal import PairBlocks, meats, normals
+from sfm_audit.audit.kernels.joint_normal import OtherSystem, PairBlocks, meats, normals
 from sfm_audit.audit.kernels.joint_parts import symmetric_of_blocks, two_informations, unit_determinants
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
@@ -39,13 +39,12 @@ class ReducedSystem:
 
 def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
     """Assemble (6) with the robust weights and with w = 1."""
-    weights = observations.weight, observations.plain_weight
-    inverses = _point_inverses(observations, weights)
     values_px = observations.residuals_px()
-    sums = joint_sums(observations, values_px, weights, (inverses[0], inverses[1]))
-    compiled = None if sums is None else _compiled_systems(observations, sums, inverses, values_px)
+    compiled = _compiled_systems(observations, values_px)
     if compiled is not None:
         return compiled
+    weights = observations.weight, observations.plain_weight
+    inverses = _point_inverses(observations, weights)
     cleaned = [off_points(observations, *pair, values_px) for pair in zip(weights, inverses, strict=True)]
     layout = observations.layout
     right, before = np.zeros((2, layout.num_columns + 1)), np.zeros((2, layout.num_columns + 1))
@@ -70,12 +69,24 @@ def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, Red
 
 
 def _compiled_systems(
-    observations: JointObservations, sums: JointSums, inverses: list[FloatArray], values_px: FloatArray
+    observations: JointObservations, values_px: FloatArray
 ) -> tuple[ReducedSystem, ReducedSystem] | None:
     """The same by the compiled sums."""
     layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
-    cleaned = sums.off_points(values_px, 0)[1], sums.off_points(values_px, 1)[1]
-    found = _of_images(observations, images, lambda some: normals(sums, some, observations.transform, cleaned))
+    if not has_joint_sums(observations):
+        return None
+    design, weight = observations.design.kept, observations.weight
+    with np.errstate(divide="ignore"):  # of images that have no columns
+        of_images = 1.0 / observations.sigma_px**2
+    by_point = two_informations(observations.index, design, weight, of_images, values_px)
+    if by_point is None:
+        return None
+    inverses = [_inverted(each) for each in by_point.informations]
+    sums = joint_sums(observations, values_px, weight, inverses[0])
+    if sums is None:
+        return None
+    other = OtherSystem(of_images, inverses[1], by_point.pulls)
+    found = _of_images(observations, images, lambda some: normals(sums, some, observations.transform, other))
     if not found:
         return None
     own_columns, others, columns = _columns_of(layout, images, [each.pairs for each in found])
@@ -144,7 +155,7 @@ def _eliminate_points(
 def _neighbourhoods(observations: JointObservations) -> Iterator[tuple[int, Neighbourhood]]:
     """Each image with the views of its points, its own and those of images behind it; a bounded number at a time."""
     for image in observations.used_images:
-        points = distinct(observations.point_idx[observations.rows(image)])
+        points = distinct(observations.point_idx[observations.rows(image)]).astype(np.int64)
         for chunk in point_chunks(observations, points):
             yield image, neighbourhood(observations, points[chunk]).from_image(image)
 
@@ -158,7 +169,7 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
     """
     layout, transform = observations.layout, observations.transform
     nothing = np.zeros((observations.num_points, 3, 3))
-    sums = joint_sums(observations, left_px, (observations.weight,), (nothing,))
+    sums = joint_sums(observations, left_px, observations.weight, nothing)
     compiled = None if sums is None else _compiled_meat(observations, sums)
     if compiled is not None:
         return compiled
@@ -214,17 +225,14 @@ def _point_inverses(observations: JointObservations, weights: tuple[FloatArray, 
     """V^-1 (P, 3, 3) with either weight."""
     if observations.points_independent:
         return [np.zeros((observations.num_points, 3, 3)) for _ in weights]
-    kept = observations.design.kept
-    compiled = two_informations(kept, weights, observations.point_idx, observations.num_points)
-    informations = compiled or (_information(observations, weight) for weight in weights)
-    return [_inverted(information) for information in informations]
+    return [_inverted(_information(observations, weight)) for weight in weights]
 
 
 def _information(observations: JointObservations, weight: FloatArray) -> FloatArray:
     everywhere = np.zeros(observations.residuals.point_idx.size)
     everywhere[observations.source] = weight
     jacobian, point_idx = observations.residuals.point_jacobian, observations.residuals.point_idx
-    return point_information(jacobian, everywhere, point_idx, len(observations.model.points))[observations.points]
+    return point_information(jacobian, everywhere, point_idx, len(observations.model.points))[0][observations.points]
 
 
 def _inverted(information: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,7 +13,9 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY, PART, POINT, Design, make_design
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout, make_layout
 from sfm_audit.audit.kernels import joint_parts as kernels
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.kernels.joint import JointIndex
+from sfm_audit.audit.kernels.threads import over_ranges
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 MIN_INLIERS: Final = 20
@@ -22,7 +25,7 @@ _SMALLEST_SQUARE: Final = 1e-300
 _MIN_VIEWS: Final = 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class JointObservations:
     """The n observations of the system by image; C = ``layout.width``.
 
@@ -47,17 +50,22 @@ class JointObservations:
     layout: Layout
     offsets: IntArray
     source: IntArray
-    image_idx: IntArray
+    image_idx: Int32Array
     points: IntArray
-    point_idx: IntArray
+    point_idx: Int32Array
     design: Design
     transform: FloatArray
     weight: FloatArray
     sigma_px: FloatArray
     rms_px: FloatArray
-    by_point: IntArray
+    by_point: Int32Array
     point_offsets: IntArray
     points_independent: bool
+
+    @cached_property
+    def index(self) -> JointIndex:
+        """Who sees what, as compiled sums take it: checked once."""
+        return JointIndex(self.offsets, self.image_idx, self.point_idx, self.by_point, self.point_offsets)
 
     @property
     def num_points(self) -> int:
@@ -79,7 +87,10 @@ class JointObservations:
 
     def residuals_px(self) -> FloatArray:
         """(n, 2) observed minus projected."""
-        return np.ascontiguousarray(self.residuals.residuals_px.take(self.source, axis=1).T)
+        out = np.empty((self.source.size, 2))
+        for axis, of_all in enumerate(self.residuals.residuals_px):
+            out[:, axis] = of_all.take(self.source)
+        return out
 
     def parts(self, image_idx: int) -> list[slice]:
         """Observations of an image whose derivatives are in memory at the same time: all, or those of a part."""
@@ -142,22 +153,22 @@ def joint_observations(
     their observations are left out of everything; so are those of ``left_out`` (I,). Points with fewer than two
     views left or with a singular V (two rays that are parallel) are left out with their observations.
     """
-    used = usable_images(model, residuals, sigma_px)
-    used &= ~left_out if left_out is not None else True
+    used = usable_images(model, residuals, sigma_px) & (True if left_out is None else ~left_out)
     candidates = _Candidates.of(residuals, used)
-    used[candidates.image_idx[~np.isfinite(candidates.jacobian.sum(axis=(0, 1)))]] = False
-    weight = candidates.weights(sigma_px)
+    used[candidates.images_not_finite()] = False
+    weight, rms_px = candidates.weights(sigma_px)
     in_use = used[candidates.image_idx]
     if not points_independent:
-        in_use &= candidates.have_regular_points(np.where(in_use, weight, 0.0), len(model.points))
+        some = weight if in_use.all() else np.where(in_use, weight, 0.0)
+        in_use &= candidates.have_regular_points(some, len(model.points))
     layout = make_layout(model, used, frame_idx, image_from_frame)
-    image_idx, seen = candidates.image_idx[in_use], candidates.point_idx[in_use]
-    num_images = len(model.images)
-    offsets = np.searchsorted(image_idx, np.arange(num_images + 1)).astype(np.int64)
+    rows, image_idx, seen = candidates.chosen(in_use)
+    weight = weight[in_use] if len(weight) > len(seen) else weight
+    offsets = np.searchsorted(image_idx, np.arange(len(model.images) + 1)).astype(np.int64)
     sight = (
         _each_by_itself(seen) if points_independent else _in_order_of_sight(image_idx, seen, offsets, len(model.points))
     )
-    source = candidates.rows[in_use][sight.order]
+    source = sight.order if rows is None else rows[sight.order]
     return JointObservations(
         model,
         residuals,
@@ -169,33 +180,36 @@ def joint_observations(
         sight.point_idx,
         make_design(model, residuals, layout, source, offsets),
         _transforms(model, layout),
-        weight[in_use][sight.order],
+        weight[sight.order],
         sigma_px,
-        candidates.rms_px(num_images),
+        rms_px,
         sight.by_point,
         sight.point_offsets,
         points_independent,
     )
 
 
-def _each_by_itself(point_idx: IntArray) -> kernels.Sight:
+def _each_by_itself(point_idx: Int32Array) -> kernels.Sight:
     """Observations of independent points."""
-    rows = np.arange(point_idx.size)
-    return kernels.Sight(point_idx, rows, rows, rows, np.arange(point_idx.size + 1))
+    order = np.arange(point_idx.size)
+    rows = order.astype(np.int32)
+    return kernels.Sight(point_idx.astype(np.int64), order, rows, rows, np.arange(point_idx.size + 1))
 
 
-def _in_order_of_sight(image_idx: IntArray, point_idx: IntArray, offsets: IntArray, num_points: int) -> kernels.Sight:
+def _in_order_of_sight(
+    image_idx: Int32Array, point_idx: Int32Array, offsets: IntArray, num_points: int
+) -> kernels.Sight:
     compiled = kernels.in_order_of_sight(image_idx, point_idx, offsets, num_points)
     if compiled is not None:
         return compiled
     seen, first = np.unique(point_idx, return_index=True)
-    points = seen[np.argsort(first)]
-    number = np.zeros(num_points, dtype=np.int64)
+    points = seen[np.argsort(first)].astype(np.int64)
+    number = np.zeros(num_points, dtype=np.int32)
     number[points] = np.arange(points.size)
     order = np.lexsort((number[point_idx], image_idx))
     place = number[point_idx[order]]
     starts = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=points.size))]).astype(np.int64)
-    return kernels.Sight(points, order, place, np.argsort(place, kind="stable"), starts)
+    return kernels.Sight(points, order, place, np.argsort(place, kind="stable").astype(np.int32), starts)
 
 
 def _transforms(model: SparseModel, layout: Layout) -> FloatArray:
@@ -221,40 +235,62 @@ def design_scores(design: FloatArray, weight: FloatArray, left_px: FloatArray) -
 class _Candidates(NamedTuple):
     """Inliers of the images that may take part: of a block of a large model a small part.
 
-    rows: (n,) columns of ModelResiduals.    image_idx, point_idx: (n,) rows of their tables.    jacobian: (2, 3, n).
-    sq_length_px2: (n,) of the residuals.
+    rows: (n,) columns of ModelResiduals, None for all.    image_idx, point_idx: (n,) rows of their tables.
+    jacobian: (2, 3, n).    residuals_px: (2, n).    counts: (I,) of each image.
     """
 
-    rows: IntArray
-    image_idx: IntArray
-    point_idx: IntArray
+    rows: IntArray | None
+    image_idx: Int32Array
+    point_idx: Int32Array
     jacobian: FloatArray
-    sq_length_px2: FloatArray
+    residuals_px: FloatArray
+    counts: IntArray
 
     @classmethod
     def of(cls, residuals: ModelResiduals, used: BoolArray) -> _Candidates:
         counts = np.diff(residuals.offsets)
+        image_idx = np.repeat(np.arange(counts.size, dtype=np.int32), counts)
+        point_idx = residuals.point_idx.astype(np.int32, copy=False)
+        jacobian, residuals_px = residuals.point_jacobian, residuals.residuals_px
+        if used[counts > 0].all():
+            return cls(None, image_idx, point_idx, jacobian, residuals_px, counts)
         rows = np.flatnonzero(np.repeat(used, counts))
-        image_idx = np.repeat(np.flatnonzero(used), counts[used])
-        jacobian, residuals_px, point_idx = residuals.point_jacobian, residuals.residuals_px, residuals.point_idx
-        if rows.size < point_idx.size:
-            jacobian, residuals_px, point_idx = jacobian[:, :, rows], residuals_px[:, rows], point_idx[rows]
-        return cls(rows, image_idx, point_idx, jacobian, (residuals_px**2).sum(axis=0))
+        of_rows = image_idx[rows], point_idx[rows], jacobian[:, :, rows], residuals_px[:, rows]
+        return cls(rows, *of_rows, np.where(used, counts, 0))
 
-    def weights(self, sigma_px: FloatArray) -> FloatArray:
-        """(n,) w / s^2."""
-        sigma, length = sigma_px[self.image_idx], np.sqrt(self.sq_length_px2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            robust = np.minimum(1.0, _HUBER * sigma / length)
-        robust[length == 0] = 1.0
-        return np.asarray(robust / sigma**2)
+    def chosen(self, in_use: BoolArray) -> tuple[IntArray | None, Int32Array, Int32Array]:
+        """Return rows, image_idx and point_idx of those in use (n,)."""
+        if in_use.all():
+            return self.rows, self.image_idx, self.point_idx
+        rows = np.flatnonzero(in_use) if self.rows is None else self.rows[in_use]
+        return rows, self.image_idx[in_use], self.point_idx[in_use]
 
-    def rms_px(self, num_images: int) -> FloatArray:
-        """(I,) root mean square length of all inliers' residuals, NaN without any."""
-        # by image: differences of a running sum lose what is small
-        total, counts = (np.bincount(self.image_idx, of, num_images) for of in (self.sq_length_px2, None))
+    def images_not_finite(self) -> Int32Array:
+        """Return the images of derivatives that are not finite, each as often as it has some."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            if np.isfinite(self.jacobian.sum()):
+                return self.image_idx[:0]
+            return np.asarray(self.image_idx[~np.isfinite(self.jacobian.sum(axis=(0, 1)))])
+
+    def weights(self, sigma_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (n,) w / s^2, and (I,) the root mean square length of all residuals, NaN without any."""
+        out, total = np.empty(self.image_idx.size), np.zeros(self.counts.size)
+        ends = np.concatenate([[0], np.cumsum(self.counts)])
+
+        def fill(start: int, stop: int) -> None:
+            rows, counts = slice(int(ends[start]), int(ends[stop])), self.counts[start:stop]
+            square = (self.residuals_px[:, rows] ** 2).sum(axis=0)
+            # by image: differences of a running sum lose what is small
+            total[start:stop] = np.bincount(np.repeat(np.arange(stop - start), counts), square, stop - start)
+            sigma = np.repeat(sigma_px[start:stop], counts)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                robust = np.minimum(1.0, _HUBER * sigma / np.sqrt(square))
+            robust[square == 0] = 1.0
+            out[rows] = robust / sigma**2
+
+        over_ranges(fill, self.counts.size, self.counts)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.sqrt(total / counts))
+            return out, np.asarray(np.sqrt(total / self.counts))
 
     def have_regular_points(self, weight: FloatArray, num_points: int) -> BoolArray:
         """(n,) whether the point has two views or more, and a V that can be inverted."""
@@ -262,8 +298,7 @@ class _Candidates(NamedTuple):
         seen[self.point_idx] = True
         num_seen = int(np.count_nonzero(seen))
         point_idx = self.point_idx if num_seen == num_points else (np.cumsum(seen) - 1)[self.point_idx]
-        information = point_information(self.jacobian, weight, point_idx, num_seen)
-        views = np.bincount(point_idx[weight > 0], minlength=num_seen)
+        information, views = point_information(self.jacobian, weight, point_idx, num_seen)
         determinants = kernels.unit_determinants(information, smallest=_SMALLEST_SQUARE, invert=False)
         if determinants is None:
             scale = np.sqrt(np.maximum(np.einsum("pii->pi", information), _SMALLEST_SQUARE))
@@ -271,8 +306,10 @@ class _Candidates(NamedTuple):
         return np.asarray(((views >= _MIN_VIEWS) & (determinants > _SINGULAR_POINT))[point_idx])
 
 
-def point_information(jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
-    """Return V (P, 3, 3) of (6): sum of w J^T J over a point's views, of J (2, 3, n)."""
+def point_information(
+    jacobian: FloatArray, weight: FloatArray, point_idx: Int32Array | IntArray, num_points: int
+) -> tuple[FloatArray, IntArray]:
+    """Return V (P, 3, 3) of (6): sum of w J^T J over a point's views, of J (2, 3, n); and (P,) views with w > 0."""
     compiled = kernels.point_information(jacobian, weight, point_idx, num_points)
     if compiled is not None:
         return compiled
@@ -282,4 +319,4 @@ def point_information(jacobian: FloatArray, weight: FloatArray, point_idx: IntAr
             product = (jacobian[0, i] * jacobian[0, j] + jacobian[1, i] * jacobian[1, j]) * weight
             product[weight == 0] = 0.0
             out[:, i, j] = out[:, j, i] = np.bincount(point_idx, product, num_points)
-    return out
+    return out, np.bincount(point_idx[weight > 0], minlength=num_points)

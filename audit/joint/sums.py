@@ -11,38 +11,39 @@ from sfm_audit.audit.kernels.joint import JointArrays, JointSums, has_joint_kern
 from sfm_audit.loaders.arrays import FloatArray
 
 
+def has_joint_sums(observations: JointObservations) -> bool:
+    """Whether the compiled sums can be asked.
+
+    Not where there is no library, where points are independent (nothing is eliminated), and where an image is so large
+    that its derivatives are not kept.
+    """
+    return has_joint_kernels() and not observations.points_independent and bool((observations.design.first >= 0).all())
+
+
 def joint_sums(
     observations: JointObservations,
     left_px: FloatArray,
-    weights: tuple[FloatArray, ...],
-    inverses: tuple[FloatArray, ...],
+    weight: FloatArray,
+    inverse: FloatArray,
     included: Mapping[int, FloatArray] | None = None,
 ) -> JointSums | None:
     """Return the compiled sums; None where the numpy path is to be taken.
 
     Parameters
     ----------
-    left_px : (n, 2)        weights, inverses : of one system or of two, (n,) and V^-1 (P, 3, 3)
+    left_px : (n, 2)        weight, inverse : (n,) and V^-1 (P, 3, 3)
     included : by image, fields (n_i, 2, r) that are parameters of the base
 
-    Notes
-    -----
-    numpy where there is no library, where points are independent (nothing is eliminated), and where an image is so
-    large that its derivatives are not kept.
     """
-    if not has_joint_kernels() or observations.points_independent or (observations.design.first < 0).any():
+    if not has_joint_sums(observations):
         return None
     return JointSums(
         JointArrays(
-            observations.offsets,
-            observations.image_idx,
-            observations.point_idx,
-            observations.by_point,
-            observations.point_offsets,
+            observations.index,
             observations.design.kept,
             left_px,
-            weights,
-            inverses,
+            weight,
+            inverse,
             {} if included is None else dict(included),
         )
     )

@@ -209,7 +209,7 @@ def with_step(base: Base, step: FloatArray) -> Base:
     padded = np.append(step[: observations.layout.num_columns], 0.0)
     layout, weight = observations.layout, observations.weight
     left = observations.residuals_px()
-    sums = joint_sums(observations, left, (weight,), (base.point_inverse,))
+    sums = joint_sums(observations, left, weight, base.point_inverse)
     if sums is not None:
         sums.subtract_step(moved_by(observations, step), left)
     for image in observations.used_images if sums is None else ():

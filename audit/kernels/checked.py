@@ -20,7 +20,7 @@ def ints(values: IntArray, size: int) -> IntArray:
     return out
 
 
-def small_ints(values: IntArray, size: int) -> SmallIntArray:
+def small_ints(values: IntArray | SmallIntArray, size: int) -> SmallIntArray:
     """Return 32-bit indices, exactly ``size`` of them; what does not fit is an error, never another index."""
     if size >= 2**31:
         raise ValueError(f"expected fewer than 2^31 observations, found {size}")

@@ -9,9 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfm_audit.audit.kernels.checked import SmallIntArray, check_indices, doubles, first_views, ints, small_ints
+from sfm_audit.audit.kernels.checked import check_indices, doubles, first_views, ints, small_ints
 from sfm_audit.audit.kernels.library import Doubles, Size, kernel, library
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.audit.kernels.threads import over_ranges
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 SCALAR: Final = 16
 """Scalar functions of a field along one axis: 1, the fourteen monomials, padding."""
@@ -22,9 +23,10 @@ DONE: Final = 0
 _MOST_VIEWS: Final = 200_000  # of the points of one image; beyond, numpy goes through them in parts
 
 
+_INDICES: Final = ("offsets", "point_offsets", "image_idx", "point_idx", "by_point", "image_of")
 _ARRAYS: Final = (
-    *("offsets", "point_offsets", "image_idx", "point_idx", "by_point", "image_of"),
-    *("design", "weight", "other_weight", "left", "point_inverse", "other_inverse"),
+    *_INDICES,
+    *("design", "weight", "left", "point_inverse"),
     *("extra_first", "extra_width", "extra"),
 )
 
@@ -42,23 +44,101 @@ class _Model(ctypes.Structure):
 _ModelPointer: Final = ctypes.POINTER(_Model)
 
 
+class JointIndex:
+    """Who sees what in a joint system: checked once, for all sums over it.
+
+    Parameters
+    ----------
+    offsets, image_idx, point_idx, by_point, point_offsets : see `sfm_audit.audit.joint.observations.JointObservations`
+    """
+
+    def __init__(
+        self,
+        offsets: IntArray,
+        image_idx: Int32Array,
+        point_idx: Int32Array,
+        by_point: Int32Array,
+        point_offsets: IntArray,
+    ) -> None:
+        self.num_images, self.num_points, self.num_rows = len(offsets) - 1, len(point_offsets) - 1, len(image_idx)
+        self.arrays: dict[str, Any] = {
+            "offsets": ints(offsets, self.num_images + 1),
+            "image_idx": small_ints(image_idx, self.num_rows),
+            "point_idx": small_ints(point_idx, self.num_rows),
+            "by_point": small_ints(by_point, self.num_rows),
+            "point_offsets": ints(point_offsets, self.num_points + 1),
+        }
+        check_indices(self.arrays, self.num_images, self.num_points)
+        self.arrays["image_of"] = self.arrays["image_idx"].take(self.arrays["by_point"])
+
+    @property
+    def offsets(self) -> IntArray:
+        """(I + 1,) image i owns rows offsets[i]:offsets[i + 1]."""
+        offsets: IntArray = self.arrays["offsets"]
+        return offsets
+
+    @cached_property
+    def is_first(self) -> BoolArray:
+        """(n,) whether no earlier row of the image shows the same point."""
+        return first_views(self.arrays)
+
+    @cached_property
+    def num_views(self) -> IntArray:
+        """(I,) views of the points of each image."""
+        per_point = np.diff(self.arrays["point_offsets"])
+        parts = over_ranges(
+            lambda start, stop: self._views_of(per_point, start, stop), self.num_images, np.diff(self.offsets)
+        )
+        return np.concatenate([np.empty(0, dtype=np.int64), *parts])
+
+    def _views_of(self, per_point: IntArray, start: int, stop: int) -> IntArray:
+        ends = self.offsets[start : stop + 1]
+        views = per_point.take(self.arrays["point_idx"][ends[0] : ends[-1]])
+        return np.asarray(np.diff(np.concatenate([[0], np.cumsum(views)])[ends - ends[0]]))
+
+    @cached_property
+    def repeats_follow(self) -> bool:
+        """Whether rows of an image that show one point follow each other."""
+        point, image = self.arrays["point_idx"], self.arrays["image_idx"]
+        again = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
+        return bool(np.count_nonzero(again) == np.count_nonzero(~self.is_first))
+
+    @cached_property
+    def track_numbers(self) -> Int32Array:
+        """(n,) `tracks` of all images."""
+        offsets = self.offsets
+        if self.is_first.all():
+            starts = np.repeat(offsets[:-1].astype(np.int32), np.diff(offsets))
+            return np.arange(offsets[-1], dtype=np.int32) - starts
+        return np.concatenate([self.tracks(image)[0] for image in range(self.num_images)])
+
+    def tracks(self, image_idx: int) -> tuple[Int32Array, int]:
+        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too; their number."""
+        rows = slice(*self.offsets[image_idx : image_idx + 2].tolist())
+        is_first = self.is_first[rows]
+        if is_first.all():
+            return np.arange(is_first.size, dtype=np.int32), is_first.size
+        point = self.arrays["point_idx"][rows]
+        number = np.cumsum(is_first) - 1
+        firsts = np.flatnonzero(is_first)
+        order = firsts[np.argsort(point[firsts], kind="stable")]
+        track = number[order[np.searchsorted(point[order], point)]]
+        return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointArrays:
     """A joint system as the kernels see it; see `sfm_audit.audit.joint.observations.JointObservations`.
 
-    design: (n, 2, C).    left_px: (n, 2).    weights, inverses: one or two systems, (n,) and (P, 3, 3).
+    design: (n, 2, C).    left_px: (n, 2).    weight: (n,).    inverse: (P, 3, 3).
     extra: by image, its included fields (n_i, 2, r).
     """
 
-    offsets: IntArray
-    image_idx: IntArray
-    point_idx: IntArray
-    by_point: IntArray
-    point_offsets: IntArray
+    index: JointIndex
     design: FloatArray
     left_px: FloatArray
-    weights: tuple[FloatArray, ...]
-    inverses: tuple[FloatArray, ...]
+    weight: FloatArray
+    inverse: FloatArray
     extra: dict[int, FloatArray]
 
 
@@ -66,8 +146,8 @@ class JointSums:
     """Sums over the views of a joint system; several threads may ask at once."""
 
     def __init__(self, arrays: JointArrays) -> None:
-        num_images, num_rows = len(arrays.offsets) - 1, len(arrays.image_idx)
-        num_points = len(arrays.point_offsets) - 1
+        self.index = index = arrays.index
+        num_images, num_rows, num_points = index.num_images, index.num_rows, index.num_points
         first = np.full(num_images, -1, dtype=np.int64)
         width = np.zeros(num_images, dtype=np.int64)
         parts: list[FloatArray] = []
@@ -75,42 +155,21 @@ class JointSums:
             first[image], width[image] = sum(part.size for part in parts), fields.shape[2]
             parts.append(np.ascontiguousarray(fields))
         extra = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(1)
-        last = len(arrays.weights) - 1
         held: dict[str, Any] = {
-            "offsets": ints(arrays.offsets, num_images + 1),
-            "image_idx": small_ints(arrays.image_idx, num_rows),
-            "point_idx": small_ints(arrays.point_idx, num_rows),
-            "by_point": small_ints(arrays.by_point, num_rows),
-            "point_offsets": ints(arrays.point_offsets, num_points + 1),
+            **index.arrays,
             "design": doubles(arrays.design, (num_rows, 2, arrays.design.shape[2])),
-            "weight": doubles(arrays.weights[0], (num_rows,)),
-            "other_weight": doubles(arrays.weights[last], (num_rows,)),
+            "weight": doubles(arrays.weight, (num_rows,)),
             "left": doubles(arrays.left_px, (num_rows, 2)),
-            "point_inverse": doubles(arrays.inverses[0], (num_points, 3, 3)),
-            "other_inverse": doubles(arrays.inverses[last], (num_points, 3, 3)),
+            "point_inverse": doubles(arrays.inverse, (num_points, 3, 3)),
             "extra_first": first,
             "extra_width": width,
             "extra": extra,
         }
-        check_indices(held, num_images, num_points)
-        held["image_of"] = held["image_idx"].take(held["by_point"])
         self._held = held
-        self._widths = arrays.design.shape[2] + width
         self.width = int(arrays.design.shape[2])
         self._model = _Model(num_images, self.width, *(held[name].ctypes.data for name in _ARRAYS))
         self._model.held = held  # whoever keeps the addresses keeps the arrays
         self._num_images = num_images
-
-    @cached_property
-    def _is_first(self) -> BoolArray:
-        """(n,) whether no earlier row of the image shows the same point."""
-        return first_views(self._held)
-
-    @cached_property
-    def _num_views(self) -> IntArray:
-        """(I,) views of the points of each image."""
-        views = np.diff(self._held["point_offsets"])[self._held["point_idx"]]
-        return np.asarray(np.diff(np.concatenate([[0], np.cumsum(views)])[self._held["offsets"]]))
 
     @property
     def num_images(self) -> int:
@@ -135,9 +194,7 @@ class JointSums:
     @property
     def repeats_follow(self) -> bool:
         """Whether rows of an image that show one point follow each other."""
-        point, image = self._held["point_idx"], self._held["image_idx"]
-        again = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
-        return bool(np.count_nonzero(again) == np.count_nonzero(~self._is_first))
+        return self.index.repeats_follow
 
     @property
     def extra_widths(self) -> IntArray:
@@ -147,54 +204,27 @@ class JointSums:
 
     def most_of(self, images: IntArray) -> tuple[int, int, int, int]:
         """Return the most rows, views of points and columns around that one of some images has; those of the widest."""
-        counts, views = np.diff(self._held["offsets"])[images], int(self._num_views[images].max(initial=0))
+        counts, views = np.diff(self.index.offsets)[images], int(self.index.num_views[images].max(initial=0))
         most = min(views, self._num_images)
         columns = most * self.width + int(np.sort(self.extra_widths)[self._num_images - most :].sum())
         return int(counts.max(initial=0)), views, columns, self.width + int(self.extra_widths.max(initial=0))
 
     def most_around(self, images: IntArray) -> int:
         """Return how many images at most see points that one of some images sees."""
-        return int(np.minimum(self._num_views[images], self._num_images).max(initial=0))
-
-    @cached_property
-    def track_numbers(self) -> SmallIntArray:
-        """(n,) `tracks` of all images."""
-        offsets: IntArray = self._held["offsets"]
-        if self._is_first.all():
-            return (np.arange(offsets[-1]) - np.repeat(offsets[:-1], np.diff(offsets))).astype(np.int32)
-        return np.concatenate([self.tracks(image)[0] for image in range(self._num_images)])
+        return int(np.minimum(self.index.num_views[images], self._num_images).max(initial=0))
 
     def can(self, image_idx: int) -> bool:
         """Whether the views of an image's points are few enough to be held at once."""
-        return bool(self._num_views[image_idx] <= _MOST_VIEWS)
+        return bool(self.index.num_views[image_idx] <= _MOST_VIEWS)
 
-    def tracks(self, image_idx: int) -> tuple[SmallIntArray, int]:
-        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too; their number."""
-        rows = slice(*self._held["offsets"][image_idx : image_idx + 2].tolist())
-        is_first = self._is_first[rows]
-        if is_first.all():
-            return np.arange(is_first.size, dtype=np.int32), is_first.size
-        point = self._held["point_idx"][rows]
-        number = np.cumsum(is_first) - 1
-        firsts = np.flatnonzero(is_first)
-        order = firsts[np.argsort(point[firsts], kind="stable")]
-        track = number[order[np.searchsorted(point[order], point)]]
-        return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
-
-    def off_points(
-        self, values_px: FloatArray, which: int = 0, *, cleaned: bool = True
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return (P, 3) V^-1 J^T w values, and (n, 2) the values minus what that removes, of one of the systems."""
+    def off_points(self, values_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (P, 3) V^-1 J^T w values, and (n, 2) the values minus what that removes."""
         function = kernel("joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size)
         if function is None or values_px.shape != self._held["left"].shape:
             raise ValueError("values of other observations, or no kernels")
-        weight, inverse = (
-            (self._held["other_weight"], self._held["other_inverse"])
-            if which
-            else (self._held["weight"], self._held["point_inverse"])
-        )
-        steps, out = np.empty((len(inverse), 3)), np.empty(values_px.shape if cleaned else (0, 2))
-        arguments = (weight, inverse, len(inverse), np.ascontiguousarray(values_px), steps, out, int(cleaned))
+        weight, inverse = self._held["weight"], self._held["point_inverse"]
+        steps, out = np.empty((len(inverse), 3)), np.empty(values_px.shape)
+        arguments = (weight, inverse, len(inverse), np.ascontiguousarray(values_px), steps, out, 1)
         function(ctypes.byref(self._model), *arguments)
         return steps, out
 

@@ -45,24 +45,38 @@ class _Room(NamedTuple):
     slabs: FloatArray
 
 
-def normals(
-    sums: JointSums, images: IntArray, transform: FloatArray, cleaned: tuple[FloatArray, FloatArray]
-) -> NormalBlocks | None:
-    """Return what some images add to the normal equations; None for the numpy path.
+class OtherSystem(NamedTuple):
+    """A second system beside that of the sums, and what pulls the points in both.
+
+    plain: (I,) its weight of all rows of an image.    inverse: (P, 3, 3) V^-1.    pulls: (P, 3) J^T w y of both.
+    """
+
+    plain: FloatArray
+    inverse: FloatArray
+    pulls: tuple[FloatArray, FloatArray]
+
+
+def normals(sums: JointSums, images: IntArray, transform: FloatArray, other: OtherSystem) -> NormalBlocks | None:
+    """Return what some images add to the normal equations of two systems; None for the numpy path.
 
     Parameters
     ----------
-    transform : (I, C, C) T        cleaned : (n, 2) residuals off the points, of both systems
+    sums : with the residuals y in the place of y~        transform : (I, C, C) T
     """
-    pointers = *([Doubles] * 3), Size, Ints, Ints, *([Doubles] * 4)
-    function, width = kernel("joint_normals", _MODEL, Size, Ints, *pointers), sums.width
-    if function is None or any(values.shape != (sums.num_rows, 2) for values in cleaned):
+    pointers = *([Doubles] * 5), Size, Ints, Ints, *([Doubles] * 4)
+    function, width, num_points = kernel("joint_normals", _MODEL, Size, Ints, *pointers), sums.width, sums.num_points
+    if function is None:
         return None
     grams, rights = np.empty((len(images), 2, width, width)), np.empty((len(images), 2, width))
+    given = (
+        doubles(other.plain, (sums.num_images,)),
+        doubles(other.inverse, (num_points, 3, 3)),
+        *(doubles(pull, (num_points, 3)) for pull in other.pulls),
+    )
 
     def some(first: int, room: _Room) -> int:
         found = room.counts[first:], room.around, *room.slabs, grams[first:], rights[first:]
-        asked = len(images) - first, images[first:], transform, *cleaned, len(room.around)
+        asked = len(images) - first, images[first:], transform, *given, len(room.around)
         return int(function(ctypes.byref(sums.model), *asked, *found))
 
     pairs = _in_turn(sums, images, transform, 2, some)
@@ -75,7 +89,7 @@ def meats(sums: JointSums, images: IntArray, transform: FloatArray) -> PairBlock
     function = kernel("joint_meats", _MODEL, Size, Ints, *pointers)
     if function is None:
         return None
-    track = sums.track_numbers
+    track = sums.index.track_numbers
 
     def some(first: int, room: _Room) -> int:
         asked = len(images) - first, images[first:], transform, track, len(room.around)

@@ -3,81 +3,100 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.checked import SmallIntArray, small_ints
+from sfm_audit.audit.kernels.checked import SmallIntArray, doubles, ints, small_ints
+from sfm_audit.audit.kernels.joint import JointIndex
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
 _DONE: Final = 0
 
 
 class DesignInputs(NamedTuple):
-    """What the design of an image is made of.
+    """What the design of the chosen rows (n,) of k images is made of, one image after the other.
 
-    facts: (25,) R, its inverse, t, fx, fy, cx, cy.
-    own: (k,) of each own parameter: 0 focal length of both axes, 1 of x, 2 of y, 3 + e distortion parameter e.
-    jacobian: (2, 3, N) in the points of all inliers of the model.
-    source: (n,) columns of it.    first: column of the image's first inlier.
-    xyz_world: (n, 3).    xy_px: (n, 2) predicted.    d_extra: (e, 2, m) of the image's m inliers.
+    offsets: (k + 1,) image i has the rows offsets[i]:offsets[i + 1].
+    facts: (k, 25) of each R, its inverse, t, fx, fy, cx, cy.
+    own: (k, Q) of each own parameter: 0 focal length of both axes, 1 of x, 2 of y, 3 + e distortion
+    parameter e; -1 none.
+    jacobian: (2, 3, N) in the points, residuals_px: (2, N), of all inliers of the model.
+    source: (n,) columns of both.    first: (k,) columns of the images' first inliers.
+    xyz_world: (n, 3).    observed_px: (n, 2).    d_extra: of each image (e, 2, m), of its m inliers.
     """
 
+    offsets: IntArray
     facts: FloatArray
     own: IntArray
     jacobian: FloatArray
+    residuals_px: FloatArray
     source: IntArray
-    first: int
+    first: IntArray
     xyz_world: FloatArray
-    xy_px: FloatArray
-    d_extra: FloatArray
+    observed_px: FloatArray
+    d_extra: Sequence[FloatArray]
 
 
 def fill_design(out: FloatArray, given: DesignInputs) -> bool:
-    """Write the design (n, 2, C) of an image; False for the numpy path."""
+    """Write the design (n, 2, C) of some images; False for the numpy path."""
     function = kernel(
-        "joint_design",
-        *([Size] * 5),
-        *(Doubles, Ints, Doubles, Ints, Size, Doubles, Doubles, Doubles, Doubles),
+        "joint_designs", *([Size] * 3), *(Ints, Doubles, Ints, Doubles, Doubles, Ints, *([Ints] * 3)), *([Doubles] * 4)
     )
-    n, width, num_all = len(out), out.shape[2], given.d_extra.shape[2]
-    local = given.source - given.first
+    (n, _, width), (k, num_own), num_all = out.shape, given.own.shape, given.jacobian.shape[2]
+    counts = np.array([each.shape[2] for each in given.d_extra], dtype=np.int64)
     is_sound = (
         given.jacobian.flags.c_contiguous
-        and given.xyz_world.shape == (n, 3)
-        and given.xy_px.shape == (n, 2)
+        and given.residuals_px.flags.c_contiguous
+        and given.residuals_px.shape == (2, num_all)
         and given.source.shape == (n,)
-        and given.facts.shape == (25,)
-        and 6 + given.own.size <= width
-        and (not n or (local.min() >= 0 and given.source.max() < given.jacobian.shape[2]))
-        and (not given.own.size or (given.own.min() >= 0 and given.own.max() < 3 + len(given.d_extra)))
-        and (not (given.own >= 3).any() or not n or local.max() < num_all)
+        and given.facts.shape == (k, 25)
+        and 6 + num_own == width
+        and len(given.d_extra) == k
+        and _lie_inside(given, counts)
     )
     if function is None or not is_sound:
         return False
-    function(
-        *(n, width, given.jacobian.shape[2], num_all, given.own.size, given.facts, given.own, given.jacobian),
-        *(given.source, given.first, given.xyz_world, np.ascontiguousarray(given.xy_px)),
-        *(np.ascontiguousarray(given.d_extra), out),
-    )
+    sizes = [each.size for each in given.d_extra]
+    starts = np.cumsum([0, *sizes])[:-1].astype(np.int64)
+    extra = np.concatenate([each.ravel() for each in given.d_extra]) if sum(sizes) else np.zeros(1)
+    of_images = ints(given.offsets, k + 1), given.facts, np.ascontiguousarray(given.own)
+    of_rows = doubles(given.xyz_world, (n, 3)), doubles(given.observed_px, (n, 2))
+    columns = given.source, given.first, counts, starts
+    function(k, width, num_all, *of_images, given.jacobian, given.residuals_px, *columns, *of_rows, extra, out)
     return True
 
 
+def _lie_inside(given: DesignInputs, counts: IntArray) -> bool:
+    """Whether all that the kernel looks up is there."""
+    n, num_all = given.source.size, given.jacobian.shape[2]
+    ends, most = given.offsets, np.array([len(each) for each in given.d_extra], dtype=np.int64) + 3
+    if ends[0] != 0 or ends[-1] != n or (np.diff(ends) < 0).any() or (given.own >= most[:, None]).any():
+        return False
+    if not n:
+        return True
+    local = given.source - np.repeat(given.first, np.diff(ends))
+    asks = np.repeat((given.own >= 3).any(axis=1), np.diff(ends))
+    is_there = local < np.repeat(counts, np.diff(ends))
+    return bool(given.source.min() >= 0 and given.source.max() < num_all and local.min() >= 0 and is_there[asks].all())
+
+
 def point_information(
-    jacobian: FloatArray, weight: FloatArray, point_idx: IntArray, num_points: int
-) -> FloatArray | None:
-    """V (P, 3, 3): sum of w J^T J over a point's views, of J (2, 3, n); None for the numpy path."""
-    function = kernel("joint_information", Size, Size, Doubles, Doubles, SmallInts, Doubles)
+    jacobian: FloatArray, weight: FloatArray, point_idx: Int32Array | IntArray, num_points: int
+) -> tuple[FloatArray, IntArray] | None:
+    """V (P, 3, 3): sum of w J^T J over a point's views, of J (2, 3, n); (P,) its views with w > 0. None: numpy path."""
+    function = kernel("joint_information", Size, Size, Doubles, Doubles, SmallInts, Doubles, Ints)
     n = weight.size
     if function is None or jacobian.shape != (2, 3, n) or not jacobian.flags.c_contiguous:
         return None
     index = small_ints(point_idx, n)
     if n and not (int(index.min()) >= 0 and int(index.max()) < num_points):
         return None
-    out = np.empty((num_points, 3, 3))
-    function(n, num_points, jacobian, np.ascontiguousarray(weight), index, out)
-    return out
+    out, views = np.empty((num_points, 3, 3)), np.empty(num_points, dtype=np.int64)
+    function(n, num_points, jacobian, np.ascontiguousarray(weight), index, out, views)
+    return out, views
 
 
 def unit_determinants(matrices: FloatArray, *, smallest: float, invert: bool) -> FloatArray | None:
@@ -104,20 +123,21 @@ class Sight(NamedTuple):
 
     points: IntArray
     order: IntArray
-    point_idx: IntArray
-    by_point: IntArray
+    point_idx: Int32Array
+    by_point: Int32Array
     point_offsets: IntArray
 
 
-def in_order_of_sight(image_idx: IntArray, point_idx: IntArray, offsets: IntArray, num_points: int) -> Sight | None:
+def in_order_of_sight(image_idx: Int32Array, point_idx: Int32Array, offsets: IntArray, num_points: int) -> Sight | None:
     """Return the order of rows (n,) by image, ``offsets`` (I + 1,); None for the numpy path."""
-    function = kernel("joint_by_sight", Size, Size, Size, *([Ints] * 9))
+    pointers = *([SmallInts] * 2), Ints, SmallInts, Ints, Ints, *([SmallInts] * 2), Ints
+    function = kernel("joint_by_sight", Size, Size, Size, *pointers)
     n, num_images = point_idx.size, len(offsets) - 1
-    if function is None or image_idx.shape != (n,) or offsets[-1] != n:
+    if function is None or image_idx.shape != (n,) or offsets[-1] != n or max(n, num_points) >= np.iinfo(np.int32).max:
         return None
-    given = (np.ascontiguousarray(values, dtype=np.int64) for values in (image_idx, point_idx))
-    ends, number, points = offsets[:-1].astype(np.int64), *np.empty((2, num_points), dtype=np.int64)
-    order, new_idx, by_point = np.empty((3, n), dtype=np.int64)
+    given = small_ints(image_idx, n), small_ints(point_idx, n)
+    ends, number, points = offsets[:-1].astype(np.int64), np.empty(num_points, np.int32), np.empty(num_points, np.int64)
+    order, new_idx, by_point = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
     starts = np.empty(num_points + 1, dtype=np.int64)
     count = function(n, num_images, num_points, *given, ends, number, points, order, new_idx, by_point, starts)
     if count < 0 or not np.array_equal(ends, offsets[1:]):
@@ -125,18 +145,34 @@ def in_order_of_sight(image_idx: IntArray, point_idx: IntArray, offsets: IntArra
     return Sight(points[:count].copy(), order, new_idx, by_point, starts[: count + 1].copy())
 
 
+class TwoInformations(NamedTuple):
+    """V (P, 3, 3) and the pull J^T w y (P, 3) of two systems."""
+
+    informations: tuple[FloatArray, FloatArray]
+    pulls: tuple[FloatArray, FloatArray]
+
+
 def two_informations(
-    design: FloatArray, weights: tuple[FloatArray, FloatArray], point_idx: IntArray, num_points: int
-) -> tuple[FloatArray, FloatArray] | None:
-    """V (P, 3, 3) with either weight (n,), of the design (n, 2, C); None for the numpy path."""
-    function = kernel("joint_two_informations", Size, Size, Size, Doubles, Doubles, Doubles, Ints, Doubles, Doubles)
-    n = point_idx.size
-    if function is None or design.shape[:2] != (n, 2) or any(weight.shape != (n,) for weight in weights):
+    index: JointIndex, design: FloatArray, weight: FloatArray, plain: FloatArray, values_px: FloatArray
+) -> TwoInformations | None:
+    """What is summed up by point with either weight; None for the numpy path.
+
+    Parameters
+    ----------
+    design : (n, 2, C)        weight : (n,)        plain : (I,) the other weight, of all rows of an image
+    values_px : (n, 2) y
+    """
+    sizes, pointers = [Size] * 3, [Doubles] * 4
+    function = kernel("joint_two_informations", *sizes, Ints, *pointers, SmallInts, *pointers)
+    n, width, num_points = index.num_rows, design.shape[2], index.num_points
+    if function is None:
         return None
+    given = doubles(design, (n, 2, width)), doubles(weight, (n,)), doubles(plain, (index.num_images,))
     out = np.empty((num_points, 3, 3)), np.empty((num_points, 3, 3))
-    given = (np.ascontiguousarray(values) for values in (design, *weights))
-    index = np.ascontiguousarray(point_idx, dtype=np.int64)
-    return out if function(n, design.shape[2], num_points, *given, index, *out) == _DONE else None
+    pulls = np.empty((num_points, 3)), np.empty((num_points, 3))
+    values = doubles(values_px, (n, 2)), index.arrays["point_idx"]
+    status = function(index.num_images, width, num_points, index.offsets, *given, *values, *out, *pulls)
+    return TwoInformations(out, pulls) if status == _DONE else None
 
 
 def near_entries(

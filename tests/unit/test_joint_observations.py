@@ -37,6 +37,7 @@ def test_points_of_one_view_or_of_parallel_rays_are_no_part(path):
     views = rng.normal(size=(5, 2, 3))
     shown = views[[0, 1, 2, 2, 3, 4, 0]]
     point_idx, weight = np.array([7, 7, 2, 2, 5, 4, 4]), np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
-    of = _Candidates(np.arange(7), np.arange(7), point_idx, np.ascontiguousarray(shown.transpose(1, 2, 0)), np.ones(7))
+    jacobian = np.ascontiguousarray(shown.transpose(1, 2, 0))
+    of = _Candidates(None, np.arange(7, dtype=np.int32), point_idx, jacobian, np.ones((2, 7)), np.ones(7, dtype=int))
     with path():
         assert of.have_regular_points(weight, 9).tolist() == [True, True, *[False] * 5]

@@ -12,21 +12,20 @@ from numpy.testing import assert_array_equal
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.kernels import joint_normal, kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.joint_normal import meats, normals
+from sfm_audit.audit.kernels.joint_normal import OtherSystem, meats, normals
 
 pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here: nothing to compare")
 
 
 @pytest.fixture(scope="module")
 def asked():
-    """Sums of a small model, its transforms and residuals off the points."""
+    """Sums of a small model, its transforms and a second system."""
     system = system_of(model_of(dataclasses.replace(SPEC, num_images=9), seed=5))
     observations, base = system.observations, system.base
-    weights = observations.weight, observations.plain_weight
-    inverses = base.point_inverse, base.point_inverse
-    sums = joint_sums(observations, base.left_px, weights, inverses)
-    cleaned = tuple(sums.off_points(observations.residuals_px(), k)[1] for k in range(2))
-    return system, sums, observations.transform, cleaned
+    sums = joint_sums(observations, base.left_px, observations.weight, base.point_inverse)
+    pull = sums.off_points(observations.residuals_px())[0]
+    other = OtherSystem(1.0 / observations.sigma_px**2, 0.5 * base.point_inverse, (pull, 2.0 * pull))
+    return system, sums, observations.transform, other
 
 
 def same(found, expected):
@@ -36,11 +35,11 @@ def same(found, expected):
 
 def test_little_room_is_filled_several_times(asked, monkeypatch):
     """Each image has up to nine around it: room for nine holds two at most."""
-    _, sums, transform, cleaned = asked
+    _, sums, transform, other = asked
     images = np.arange(9)
-    plenty = normals(sums, images, transform, cleaned), meats(sums, images, transform)
+    plenty = normals(sums, images, transform, other), meats(sums, images, transform)
     monkeypatch.setattr(joint_normal, "_PAIRS_AT_ONCE", 1)
-    found = normals(sums, images, transform, cleaned), meats(sums, images, transform)
+    found = normals(sums, images, transform, other), meats(sums, images, transform)
     assert plenty[0].pairs.counts.sum() > 18
     same(found[0].pairs, plenty[0].pairs)
     same(found[0][1:], plenty[0][1:])
@@ -48,13 +47,13 @@ def test_little_room_is_filled_several_times(asked, monkeypatch):
 
 
 def test_an_image_has_the_blocks_it_has_alone(asked):
-    _, sums, transform, cleaned = asked
+    _, sums, transform, other = asked
     some = np.array([6, 2, 7])
-    together, scores = normals(sums, some, transform, cleaned), meats(sums, some, transform)
+    together, scores = normals(sums, some, transform, other), meats(sums, some, transform)
     ends = np.cumsum(together.pairs.counts)
     for k, image in enumerate(some):
         alone, pairs = (
-            normals(sums, some[k : k + 1], transform, cleaned),
+            normals(sums, some[k : k + 1], transform, other),
             slice(ends[k] - together.pairs.counts[k], ends[k]),
         )
         assert alone.pairs.around[0] == image
@@ -68,15 +67,15 @@ def test_an_image_has_the_blocks_it_has_alone(asked):
 
 
 def test_nobody_has_no_blocks_and_nobody_else_is_asked(asked):
-    _, sums, transform, cleaned = asked
+    _, sums, transform, other = asked
     nobody = np.empty(0, dtype=np.int64)
-    assert normals(sums, nobody, transform, cleaned).pairs.slabs.shape == (2, 0, 8, 8)
+    assert normals(sums, nobody, transform, other).pairs.slabs.shape == (2, 0, 8, 8)
     assert meats(sums, nobody, transform).around.size == 0
     for wrong in (np.array([9]), np.array([-1])):
         with pytest.raises(ValueError, match=r"expected 0 \.\. 8"):
             meats(sums, wrong, transform)
     with numpy_only():
-        assert normals(sums, np.arange(9), transform, cleaned) is None
+        assert normals(sums, np.arange(9), transform, other) is None
         assert meats(sums, np.arange(9), transform) is None
 
 

@@ -25,6 +25,7 @@ from sfm_audit.audit.joint.observations import _in_order_of_sight, joint_observa
 from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.joint import JointIndex
 from sfm_audit.audit.kernels.joint_parts import in_order_of_sight, two_informations
 from sfm_audit.audit.kernels.joint_scores import Asked, IncludedArrays, JointScores, SeenArrays
 from sfm_audit.audit.kernels.threads import over_ranges, threads
@@ -253,18 +254,26 @@ def test_the_order_of_sight_is_numpy_s(seed):
     assert in_order_of_sight(image_idx, point_idx, offsets[:-2], 40) is None
 
 
-def test_two_weights_at_once_give_the_information_of_each():
+def test_two_weights_at_once_give_the_information_and_the_pull_of_each():
     rng = np.random.default_rng(0)
-    design, weights = rng.normal(size=(30, 2, 8)), (rng.random(30), rng.random(30))
-    point_idx = rng.integers(0, 7, size=30)
-    found = two_informations(design, weights, point_idx, 8)
-    for each, weight in zip(found, weights, strict=True):
-        expected = np.zeros((8, 3, 3))
+    design, weight, plain, values = rng.normal(size=(30, 2, 8)), rng.random(30), rng.random(4), rng.normal(size=(30, 2))
+    offsets = np.array([0, 11, 11, 25, 30])
+    image_idx, point_idx = np.repeat(np.arange(4), np.diff(offsets)), rng.integers(0, 7, size=30)
+    by_point = np.argsort(point_idx, kind="stable")
+    point_offsets = np.concatenate([[0], np.cumsum(np.bincount(point_idx, minlength=8))])
+    index = JointIndex(offsets, image_idx, point_idx, by_point, point_offsets)
+    found = two_informations(index, design, weight, plain, values)
+    for k, each in enumerate((weight, plain[image_idx])):
+        information, pull = np.zeros((8, 3, 3)), np.zeros((8, 3))
         jacobian = design[:, :, 3:6]
-        np.add.at(expected, point_idx, np.einsum("nai,naj,n->nij", jacobian, jacobian, weight))
-        assert_allclose(each, expected, atol=1e-12)
-    assert two_informations(design, weights, point_idx + 2, 8) is None
-    assert two_informations(design, (weights[0], weights[1][:3]), point_idx, 8) is None
+        np.add.at(information, point_idx, np.einsum("nai,naj,n->nij", jacobian, jacobian, each))
+        np.add.at(pull, point_idx, np.einsum("nai,na,n->ni", jacobian, values, each))
+        assert_allclose(found.informations[k], information, atol=1e-12)
+        assert_allclose(found.pulls[k], pull, atol=1e-12)
+    with pytest.raises(ValueError, match="expected an array of shape"):
+        two_informations(index, design, weight, plain[:3], values)
+    with numpy_only():
+        assert two_informations(index, design, weight, plain, values) is None
 
 
 def test_points_are_numbered_in_the_order_of_sight_on_both_paths():

@@ -27,8 +27,8 @@ from sfm_audit.audit.joint.observations import joint_observations
 from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.joint import JointArrays, JointSums
-from sfm_audit.audit.kernels.joint_normal import meats, normals
+from sfm_audit.audit.kernels.joint import JointArrays, JointIndex, JointSums
+from sfm_audit.audit.kernels.joint_normal import OtherSystem, meats, normals
 from sfm_audit.audit.kernels.joint_parts import (
     dense_entries,
     near_entries,
@@ -253,6 +253,9 @@ def test_verdicts_are_the_same(both):
 # what C is given
 
 
+INDICES = "offsets", "image_idx", "point_idx", "by_point", "point_offsets"
+
+
 def small_arrays(**changes):
     rng = np.random.default_rng(0)
     design = rng.normal(size=(6, 2, 8))
@@ -264,11 +267,12 @@ def small_arrays(**changes):
         "point_offsets": np.array([0, 2, 4, 6]),
         "design": design,
         "left_px": rng.normal(size=(6, 2)),
-        "weights": (np.ones(6),),
-        "inverses": (np.tile(np.eye(3), (3, 1, 1)),),
+        "weight": np.ones(6),
+        "inverse": np.tile(np.eye(3), (3, 1, 1)),
         "extra": {},
-    }
-    return JointArrays(**(given | changes))
+    } | changes
+    index = JointIndex(*(given.pop(name) for name in INDICES))
+    return JointArrays(index, **given)
 
 
 @pytest.mark.parametrize(
@@ -291,19 +295,20 @@ def test_indices_that_lead_outside_never_reach_the_kernel(changes, told):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, 0.0])
 def test_extreme_numbers_come_through_as_numbers(value):
-    arrays = small_arrays(design=np.full((6, 2, 8), value), weights=(np.full(6, value),))
+    arrays = small_arrays(design=np.full((6, 2, 8), value), weight=np.full(6, value))
     sums = JointSums(arrays)
     steps, cleaned = sums.off_points(arrays.left_px)
     assert (steps.shape, cleaned.shape) == ((3, 3), (6, 2))
     one, first, turn = np.array([1]), np.array([0]), np.stack([np.eye(8)] * 2)
-    assert normals(sums, one, turn, (cleaned, cleaned)).pairs.around.tolist() == [1]
+    other = OtherSystem(np.full(2, value), np.tile(np.eye(3), (3, 1, 1)), (steps, steps))
+    assert normals(sums, one, turn, other).pairs.around.tolist() == [1]
     assert meats(sums, first, turn).slabs.shape == (1, 2, 8, 8)
 
 
 def test_an_image_without_observations_has_nothing_around():
     sums = JointSums(small_arrays(offsets=np.array([0, 0, 6]), image_idx=np.ones(6, int)))
-    assert sums.tracks(0)[1] == 0
-    assert sums.tracks(1) == (pytest.approx([0, 1, 2, -1, -2, -3]), 3)
+    assert sums.index.tracks(0)[1] == 0
+    assert sums.index.tracks(1) == (pytest.approx([0, 1, 2, -1, -2, -3]), 3)
     assert not sums.repeats_follow
     assert JointSums(small_arrays()).repeats_follow
 
@@ -311,7 +316,8 @@ def test_an_image_without_observations_has_nothing_around():
 def test_points_whose_weight_is_zero_add_nothing_whatever_they_are():
     jacobian = np.ones((2, 3, 4))
     jacobian[:, :, 3] = np.nan
-    found = point_information(jacobian, np.array([1.0, 2.0, 0.5, 0.0]), np.array([0, 0, 2, 2]), 3)
+    found, views = point_information(jacobian, np.array([1.0, 2.0, 0.5, 0.0]), np.array([0, 0, 2, 2]), 3)
+    assert views.tolist() == [2, 0, 1]
     assert_allclose(found, np.ones((3, 3, 3)) * np.array([6.0, 0.0, 1.0])[:, None, None])
     assert point_information(jacobian, np.ones(3), np.array([0, 0, 2]), 3) is None
     assert point_information(jacobian, np.ones(4), np.array([0, 0, 2, 3]), 3) is None

@@ -19,10 +19,8 @@ typedef struct {
     const int32_t *image_of;     /* (n) in the order of by_point */
     const double *design;        /* (n, 2, width) */
     const double *weight;        /* (n) */
-    const double *other_weight;  /* (n) of the second system, see joint_normal */
     const double *left;          /* (n, 2) */
     const double *point_inverse; /* (P, 3, 3) */
-    const double *other_inverse; /* (P, 3, 3) */
     const int64_t *extra_first;  /* (I) first number in extra, -1 without included fields */
     const int64_t *extra_width;  /* (I) */
     const double *extra;         /* per image (n_i, 2, r) */

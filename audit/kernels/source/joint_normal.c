@@ -2,13 +2,28 @@
  * audit/joint/normal.py is the numpy twin). */
 #include "joint.h"
 
-/* One pair of systems: the robust weights and those of the second system. `padded` is the width, rounded up to LANES.
+/* Room for one image after the other. */
+typedef struct {
+    surroundings near;
+    double *nuisance, *absorbed, *other, *scores;
+    unsigned char *differs;
+    int64_t *place;
+} normal_space;
+
+/* Two systems: the robust weights of the model, and weights that all rows of an image have in common; V^-1 and the pull J^T w y
+ * of each point with both. */
+typedef struct {
+    const double *plain;                /* (I) */
+    const double *inverse[2], *pull[2]; /* (P, 3, 3), (P, 3) */
+} two_systems;
+
+/* `padded` is the width, rounded up to LANES.
  *
  * slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the design
  * without T).    more_slab: what the second system has more: of points whose weights differ, all others say the same twice. */
 INLINE void add_slab(
     const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
-    const double *other_absorbed, const unsigned char *differs, double *slab, double *more_slab) {
+    const double *other_absorbed, const unsigned char *differs, double plain, double *slab, double *more_slab) {
     int64_t width = m->width;
     pair_of_rows pair = {{0.0}, {0.0}};
     double along[3][MOST_COLUMNS];
@@ -32,7 +47,6 @@ INLINE void add_slab(
         }
         if (!differs[near->own[j]]) continue;
         const double *other = other_absorbed + 3 * padded * near->own[j];
-        double plain = m->other_weight[near->view[j]];
         for (int64_t c = 0; c < padded; c++) {
             double *to = more_slab + c * padded;
             for (int i = 0; i < 3; i++) {
@@ -67,12 +81,12 @@ INLINE void turn_rows(
 
 /* V^-1 W^T (3, padded) of a row; nuisance (2, padded): its N. */
 INLINE void absorb_row(
-    const joint_model *m, int64_t row, const double *nuisance, int64_t padded, const double *weight, const double *inverse,
+    const joint_model *m, int64_t row, const double *nuisance, int64_t padded, double weight, const double *inverse,
     double *out) {
     const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width, *v = inverse + 9 * m->point_idx[row];
     for (int i = 0; i < 3; i++) {
-        double x = weight[row] * (v[3 * i] * jx[0] + v[3 * i + 1] * jx[1] + v[3 * i + 2] * jx[2]);
-        double y = weight[row] * (v[3 * i] * jy[0] + v[3 * i + 1] * jy[1] + v[3 * i + 2] * jy[2]);
+        double x = weight * (v[3 * i] * jx[0] + v[3 * i + 1] * jx[1] + v[3 * i + 2] * jx[2]);
+        double y = weight * (v[3 * i] * jy[0] + v[3 * i + 1] * jy[1] + v[3 * i + 2] * jy[2]);
         for (int64_t d = 0; d < padded; d += LANES) {
             STORE(out + i * padded + d) = x * LOAD(nuisance + d) + y * LOAD(nuisance + padded + d);
         }
@@ -81,20 +95,19 @@ INLINE void absorb_row(
 
 /* V^-1 W^T of all rows of an image, of both systems; differs (n): whether they do. */
 INLINE void absorb_rows(
-    const joint_model *m, int64_t first, int64_t n, int64_t padded, const double *nuisance, double *absorbed, double *other,
-    unsigned char *differs) {
+    const joint_model *m, const two_systems *of, double plain, int64_t first, int64_t n, int64_t padded, const double *nuisance,
+    double *absorbed, double *other, unsigned char *differs) {
     for (int64_t i = 0; i < n; i++) {
         if (i + AHEAD < n) {
             int64_t point = m->point_idx[first + i + AHEAD];
-            SOON(m->point_inverse + 9 * point), SOON(m->point_inverse + 9 * point + 8);
-            SOON(m->other_inverse + 9 * point), SOON(m->other_inverse + 9 * point + 8);
+            for (int k = 0; k < 2; k++) SOON(of->inverse[k] + 9 * point), SOON(of->inverse[k] + 9 * point + 8);
         }
         const double *mine = nuisance + 2 * padded * i;
         int64_t point = m->point_idx[first + i];
         /* of a point whose weights are the same, the inverses are, to the last bit */
-        differs[i] = memcmp(m->point_inverse + 9 * point, m->other_inverse + 9 * point, 9 * sizeof(double)) != 0;
-        absorb_row(m, first + i, mine, padded, m->weight, m->point_inverse, absorbed + 3 * padded * i);
-        if (differs[i]) absorb_row(m, first + i, mine, padded, m->other_weight, m->other_inverse, other + 3 * padded * i);
+        differs[i] = memcmp(of->inverse[0] + 9 * point, of->inverse[1] + 9 * point, 9 * sizeof(double)) != 0;
+        absorb_row(m, first + i, mine, padded, m->weight[first + i], of->inverse[0], absorbed + 3 * padded * i);
+        if (differs[i]) absorb_row(m, first + i, mine, padded, plain, of->inverse[1], other + 3 * padded * i);
     }
 }
 
@@ -120,21 +133,24 @@ INLINE void add_row_gram(int64_t padded, const double *nuisance, double scale, d
     }
 }
 
-/* Of an image's own rows and both systems: grams (2, width, width) N^T w N, rights (2, width) N^T w cleaned. */
+/* Of an image's own rows and both systems: grams (2, width, width) N^T w N, rights (2, width) N^T w (y - J V^-1 J^T w y). */
 INLINE void add_own(
-    const joint_model *m, int64_t first, int64_t n, int64_t padded, const double *nuisance, const double *const cleaned[2],
-    double *grams, double *rights) {
+    const joint_model *m, const two_systems *of, double plain, int64_t first, int64_t n, int64_t padded,
+    const normal_space *space, double *grams, double *rights) {
     double gram[2][MOST_COLUMNS * MOST_COLUMNS] = {{0.0}}, right[2][MOST_COLUMNS] = {{0.0}};
     int64_t width = m->width;
     for (int64_t i = 0; i < n; i++) {
-        const double *own = nuisance + i * 2 * padded;
-        double w[2] = {m->weight[first + i], m->other_weight[first + i]};
+        const double *own = space->nuisance + i * 2 * padded, *y = m->left + 2 * (first + i);
+        double w[2] = {m->weight[first + i], plain};
         add_row_gram(padded, own, w[0], gram[0]);
         if (w[1] != w[0]) add_row_gram(padded, own, w[1] - w[0], gram[1]); /* what the second system has more */
         for (int k = 0; k < 2; k++) {
-            double x = w[k] * cleaned[k][2 * (first + i)], y = w[k] * cleaned[k][2 * (first + i) + 1];
+            const double *a = (k && space->differs[i] ? space->other : space->absorbed) + 3 * padded * i;
+            const double *pull = of->pull[k] + 3 * m->point_idx[first + i];
+            double wx = w[k] * y[0], wy = w[k] * y[1];
             for (int64_t d = 0; d < padded; d += LANES) {
-                STORE(right[k] + d) += x * LOAD(own + d) + y * LOAD(own + padded + d);
+                wide taken = pull[0] * LOAD(a + d) + pull[1] * LOAD(a + padded + d) + pull[2] * LOAD(a + 2 * padded + d);
+                STORE(right[k] + d) += wx * LOAD(own + d) + wy * LOAD(own + padded + d) - taken;
             }
         }
     }
@@ -147,14 +163,6 @@ INLINE void add_own(
         rights[c] = right[0][c], rights[width + c] = right[1][c];
     }
 }
-
-/* Room for one image after the other. */
-typedef struct {
-    surroundings near;
-    double *nuisance, *absorbed, *other, *scores;
-    unsigned char *differs;
-    int64_t *place;
-} normal_space;
 
 /* With room for the largest of some images. */
 static int has_room(const joint_model *m, int64_t num, const int64_t *images, int64_t padded, normal_space *out) {
@@ -184,23 +192,25 @@ static void leave(normal_space *space) {
 
 /* joint_normals of one image, its views collected. */
 INLINE void normal_of(
-    const joint_model *m, int64_t image, int64_t padded, const normal_space *space, const double *transform,
-    const double *const cleaned[2], double *slab, double *other_slab, double *grams, double *rights) {
+    const joint_model *m, const two_systems *of, int64_t image, int64_t padded, const normal_space *space,
+    const double *transform, double *slab, double *other_slab, double *grams, double *rights) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width, size = padded * padded;
     int64_t square = width * width;
     const surroundings *near = &space->near;
+    double plain = of->plain[image];
     turn_rows(m, padded, first, n, transform + image * square, space->nuisance);
-    absorb_rows(m, first, n, padded, space->nuisance, space->absorbed, space->other, space->differs);
+    absorb_rows(m, of, plain, first, n, padded, space->nuisance, space->absorbed, space->other, space->differs);
     for (int64_t k = 0; k < near->num_images; k++) {
         double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
         const double *of_rows = transform + near->image[k] * square;
         memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
-        add_slab(m, padded, near, k, space->absorbed, space->other, space->differs, here[0], here[1]);
+        add_slab(
+            m, padded, near, k, space->absorbed, space->other, space->differs, of->plain[near->image[k]], here[0], here[1]);
         for (int64_t c = 0; c < size; c++) here[1][c] += here[0][c];
         turn_back(here[0], padded, width, of_rows, scale, slab + k * square);
         turn_back(here[1], padded, width, of_rows, scale, other_slab + k * square);
     }
-    add_own(m, first, n, padded, space->nuisance, cleaned, grams, rights);
+    add_own(m, of, plain, first, n, padded, space, grams, rights);
     for (int64_t c = 0; near->num_images && c < square; c++) {
         slab[c] += 0.5 * grams[c], other_slab[c] += 0.5 * grams[square + c];
     }
@@ -209,17 +219,18 @@ INLINE void normal_of(
 /* What images add to the normal equations without the points, of both systems (reduced_systems of audit/joint/normal.py), one
  * image after the other as long as `room` blocks hold it.
  *
- * images (num); transform (I, width, width): T.    cleaned, other_cleaned (n, 2): residuals off the points.
+ * images (num); transform (I, width, width): T.    plain (I): the second system's weight of each image's rows;
+ * other_inverse (P, 3, 3), pull, other_pull (P, 3): see two_systems.
  * Out: counts (num): images of each, itself and those behind it that see its points; around (room): who they are; slabs,
  * other_slabs (room, width, width): block between each of them (rows) and the image (columns), its own one halved; grams (num,
  * 2, width, width), rights (num, 2, width). Returns how many images were done; fewer than there are where the next one finds no
  * room, -1 without memory or where there are too many columns. */
 WIDE KERNEL int64_t joint_normals(
-    const joint_model *m, int64_t num, const int64_t *images, const double *transform, const double *cleaned,
-    const double *other_cleaned, int64_t room, int64_t *counts, int64_t *around, double *slabs, double *other_slabs,
-    double *grams, double *rights) {
+    const joint_model *m, int64_t num, const int64_t *images, const double *transform, const double *plain,
+    const double *other_inverse, const double *pull, const double *other_pull, int64_t room, int64_t *counts, int64_t *around,
+    double *slabs, double *other_slabs, double *grams, double *rights) {
     int64_t width = m->width, padded = (width + LANES - 1) / LANES * LANES, used = 0, done = 0, square = width * width;
-    const double *const both[2] = {cleaned, other_cleaned};
+    const two_systems of = {plain, {m->point_inverse, other_inverse}, {pull, other_pull}};
     normal_space space = {{0}, NULL, NULL, NULL, NULL, NULL, NULL};
     if (padded > MOST_COLUMNS || !has_room(m, num, images, padded, &space)) {
         leave(&space);
@@ -231,9 +242,9 @@ WIDE KERNEL int64_t joint_normals(
         double *gram = grams + 2 * done * square, *right = rights + 2 * done * width;
         collect(m, m->offsets[image], m->offsets[image + 1], image, space.place, &space.near);
         if (space.near.num_images > room - used) break;
-        if (padded == 8) normal_of(m, image, 8, &space, transform, both, slab, other, gram, right);
-        else if (padded == 12) normal_of(m, image, 12, &space, transform, both, slab, other, gram, right);
-        else normal_of(m, image, padded, &space, transform, both, slab, other, gram, right);
+        if (padded == 8) normal_of(m, &of, image, 8, &space, transform, slab, other, gram, right);
+        else if (padded == 12) normal_of(m, &of, image, 12, &space, transform, slab, other, gram, right);
+        else normal_of(m, &of, image, padded, &space, transform, slab, other, gram, right);
         memcpy(around + used, space.near.image, (size_t)space.near.num_images * sizeof *around);
         counts[done] = space.near.num_images, used += counts[done];
     }

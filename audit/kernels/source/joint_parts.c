@@ -1,15 +1,19 @@
 /* What the joint system is made of (docs/method.md section 11): derivatives, the information on points, entries of an inverse. */
 #include "kernel.h"
 
-enum { TILE = 8 };
+enum { TILE = 8, AHEAD = 16 };
 
 /* V (P, 3, 3): sum of w J^T J over a point's views; jacobian (2, 3, n) and weight (n) are of all observations. Where the
- * weight is zero nothing is added, whatever the derivatives. */
+ * weight is zero nothing is added, whatever the derivatives. views (P): how many have a weight above it. */
 KERNEL int64_t joint_information(
-    int64_t n, int64_t num_points, const double *jacobian, const double *weight, const int32_t *point_idx, double *out) {
+    int64_t n, int64_t num_points, const double *jacobian, const double *weight, const int32_t *point_idx, double *out,
+    int64_t *views) {
     memset(out, 0, (size_t)(9 * num_points) * sizeof *out);
+    memset(views, 0, (size_t)num_points * sizeof *views);
     for (int64_t k = 0; k < n; k++) {
+        if (k + AHEAD < n) SOON(out + 9 * point_idx[k + AHEAD]), SOON(out + 9 * point_idx[k + AHEAD] + 8);
         double w = weight[k], *v = out + 9 * point_idx[k];
+        views[point_idx[k]] += w > 0.0;
         if (w == 0.0) continue;
         double x[3], y[3];
         for (int i = 0; i < 3; i++) x[i] = jacobian[i * n + k], y[i] = jacobian[(3 + i) * n + k];
@@ -85,32 +89,40 @@ KERNEL int64_t joint_dense_entries(int64_t num, const int64_t *columns, int64_t 
     return DONE;
 }
 
-/* The design (n, 2, width) of one image: derivatives in the rotation, in the points, in the own parameters; zero padding.
+/* The design (n, 2, width) of the chosen rows of images, one after the other: derivatives in the rotation, in the points, in the
+ * own parameters; zero where an image has none.
  *
- * facts: R (9), its inverse (9), t (3), fx, fy, cx, cy.    own (num_own): 0 focal length of both axes, 1 of x, 2 of y, 3 + e
- * distortion parameter e.    jacobian (2, 3, total), source (n): its columns.    xyz (n, 3) world, predicted (n, 2) px.
- * extra (num_extra, 2, all): of all the image's inliers, which (n) among them. */
-KERNEL int64_t joint_design(
-    int64_t n, int64_t width, int64_t total, int64_t all, int64_t num_own, const double *facts, const int64_t *own,
-    const double *jacobian, const int64_t *source, int64_t first, const double *xyz, const double *predicted,
-    const double *extra, double *out) {
-    const double *r = facts, *inverse = facts + 9, *t = facts + 18, *focal = facts + 21, *centre = facts + 23;
-    for (int64_t k = 0; k < n; k++) {
-        const double *p = xyz + 3 * k;
-        double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
-        double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
-        for (int axis = 0; axis < 2; axis++) {
-            double *to = out + (2 * k + axis) * width, j[3], cam[3];
-            for (int i = 0; i < 3; i++) j[i] = jacobian[(3 * axis + i) * total + source[k]];
-            for (int i = 0; i < 3; i++) cam[i] = inverse[i] * j[0] + inverse[3 + i] * j[1] + inverse[6 + i] * j[2];
-            to[0] = cam[2] * y - cam[1] * z, to[1] = cam[0] * z - cam[2] * x, to[2] = cam[1] * x - cam[0] * y;
-            to[3] = j[0], to[4] = j[1], to[5] = j[2];
-            for (int64_t c = 0; c < num_own; c++) {
-                if (own[c] >= 3) to[6 + c] = extra[(2 * (own[c] - 3) + axis) * all + source[k] - first];
-                else if (own[c] == 0 || own[c] == axis + 1) to[6 + c] = (predicted[2 * k + axis] - centre[axis]) / focal[axis];
-                else to[6 + c] = 0.0;
+ * offsets (num + 1): where each image's rows begin.    facts (num, 25): R, its inverse, t, fx, fy, cx, cy.
+ * own (num, width - 6): 0 focal length of both axes, 1 of x, 2 of y, 3 + e distortion parameter e, -1 none.
+ * jacobian (2, 3, total), residuals (2, total); source (n): their columns.    first, counts, starts (num): of an image's inliers
+ * the first column, their number, and where extra (e, 2, count) of them begins.    xyz (n, 3) world, observed (n, 2) px. */
+KERNEL int64_t joint_designs(
+    int64_t num, int64_t width, int64_t total, const int64_t *offsets, const double *all_facts, const int64_t *all_own,
+    const double *jacobian, const double *residuals, const int64_t *source, const int64_t *first, const int64_t *counts,
+    const int64_t *starts, const double *xyz, const double *observed, const double *extra, double *restrict out) {
+    for (int64_t image = 0; image < num; image++) {
+        const double *r = all_facts + 25 * image, *inverse = r + 9, *t = r + 18, *focal = r + 21, *centre = r + 23;
+        const int64_t *own = all_own + image * (width - 6), count = counts[image];
+        const double *of_image = extra + starts[image];
+        for (int64_t k = offsets[image]; k < offsets[image + 1]; k++) {
+            const double *p = xyz + 3 * k;
+            double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
+            double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
+            for (int axis = 0; axis < 2; axis++) {
+                const double *of_point = jacobian + 3 * axis * total + source[k];
+                double *to = out + (2 * k + axis) * width, j[3] = {of_point[0], of_point[total], of_point[2 * total]}, cam[3];
+                for (int i = 0; i < 3; i++) cam[i] = inverse[i] * j[0] + inverse[3 + i] * j[1] + inverse[6 + i] * j[2];
+                to[0] = cam[2] * y - cam[1] * z, to[1] = cam[0] * z - cam[2] * x, to[2] = cam[1] * x - cam[0] * y;
+                to[3] = j[0], to[4] = j[1], to[5] = j[2];
+                for (int64_t c = 0; c < width - 6; c++) {
+                    double value = 0.0;
+                    if (own[c] >= 3) value = of_image[(2 * (own[c] - 3) + axis) * count + source[k] - first[image]];
+                    else if (own[c] == 0 || own[c] == axis + 1) {
+                        value = (observed[2 * k + axis] - residuals[axis * total + source[k]] - centre[axis]) / focal[axis];
+                    }
+                    to[6 + c] = value;
+                }
             }
-            for (int64_t c = 6 + num_own; c < width; c++) to[c] = 0.0;
         }
     }
     return DONE;
@@ -124,8 +136,8 @@ KERNEL int64_t joint_design(
  * of each new one; new_idx (n): its point's place in points; by_point (n): new rows by point, each point's in order; offsets
  * (num_points + 1): where each point's begin, for those that are seen.    Returns how many are seen, or -1. */
 KERNEL int64_t joint_by_sight(
-    int64_t n, int64_t num_images, int64_t num_points, const int64_t *image_idx, const int64_t *point_idx, int64_t *ends,
-    int64_t *number, int64_t *points, int64_t *order, int64_t *new_idx, int64_t *by_point, int64_t *offsets) {
+    int64_t n, int64_t num_images, int64_t num_points, const int32_t *image_idx, const int32_t *point_idx, int64_t *ends,
+    int32_t *number, int64_t *points, int64_t *order, int32_t *new_idx, int32_t *by_point, int64_t *offsets) {
     int64_t count = 0;
     for (int64_t row = 0; row < n; row++) {
         if (point_idx[row] < 0 || point_idx[row] >= num_points || image_idx[row] < 0 || image_idx[row] >= num_images) return -1;
@@ -133,39 +145,52 @@ KERNEL int64_t joint_by_sight(
     for (int64_t point = 0; point < num_points; point++) number[point] = -1;
     for (int64_t row = 0; row < n; row++) {
         int64_t point = point_idx[row];
-        if (number[point] < 0) offsets[count] = 0, points[count] = point, number[point] = count++;
+        if (number[point] < 0) offsets[count] = 0, points[count] = point, number[point] = (int32_t)count++;
         offsets[number[point]]++;
     }
     for (int64_t k = 0, total = 0; k <= count; k++) {
         int64_t here = k < count ? offsets[k] : 0;
         offsets[k] = total, total += here;
     }
-    for (int64_t row = 0; row < n; row++) by_point[offsets[number[point_idx[row]]]++] = row;
+    for (int64_t row = 0; row < n; row++) by_point[offsets[number[point_idx[row]]]++] = (int32_t)row;
     for (int64_t k = count; k > 0; k--) offsets[k] = offsets[k - 1];
     offsets[0] = 0;
     for (int64_t k = 0; k < count; k++) {
         for (int64_t j = offsets[k]; j < offsets[k + 1]; j++) {
             int64_t row = by_point[j], here = ends[image_idx[row]]++;
-            order[here] = row, new_idx[here] = k, by_point[j] = here;
+            order[here] = row, new_idx[here] = (int32_t)k, by_point[j] = (int32_t)here;
         }
     }
     return count;
 }
 
-/* V (P, 3, 3) of joint_information with two weights at once, of the design's columns. */
+/* V (P, 3, 3) and J^T w y (P, 3) with two weights at once, of the design's columns.
+ *
+ * weight (n), values (n, 2) y, point_idx (n); plain (num_images): the second weight, of all rows of an image. */
 KERNEL int64_t joint_two_informations(
-    int64_t n, int64_t width, int64_t num_points, const double *design, const double *weight, const double *other_weight,
-    const int64_t *point_idx, double *out, double *other) {
-    memset(out, 0, (size_t)(9 * num_points) * sizeof *out);
-    memset(other, 0, (size_t)(9 * num_points) * sizeof *other);
+    int64_t num_images, int64_t width, int64_t num_points, const int64_t *offsets, const double *design, const double *weight,
+    const double *plain, const double *values, const int32_t *point_idx, double *out, double *other, double *pull,
+    double *other_pull) {
+    int64_t n = offsets[num_images];
     for (int64_t row = 0; row < n; row++) {
         if (point_idx[row] < 0 || point_idx[row] >= num_points) return NEEDS_NUMPY;
-        const double *x = design + row * 2 * width + 3, *y = x + width;
-        double w = weight[row], u = other_weight[row], *v = out + 9 * point_idx[row], *p = other + 9 * point_idx[row];
-        for (int i = 0; i < 3; i++) {
-            for (int j = i; j < 3; j++) {
-                double both = x[i] * x[j] + y[i] * y[j];
-                v[3 * i + j] += w * both, p[3 * i + j] += u * both;
+    }
+    memset(out, 0, (size_t)(9 * num_points) * sizeof *out), memset(other, 0, (size_t)(9 * num_points) * sizeof *other);
+    memset(pull, 0, (size_t)(3 * num_points) * sizeof *pull);
+    memset(other_pull, 0, (size_t)(3 * num_points) * sizeof *other_pull);
+    for (int64_t image = 0; image < num_images; image++) {
+        for (int64_t row = offsets[image]; row < offsets[image + 1]; row++) {
+            const double *x = design + row * 2 * width + 3, *y = x + width;
+            double w = weight[row], u = plain[image];
+            double *v = out + 9 * point_idx[row], *p = other + 9 * point_idx[row];
+            double *g = pull + 3 * point_idx[row], *h = other_pull + 3 * point_idx[row];
+            for (int i = 0; i < 3; i++) {
+                double along = x[i] * values[2 * row] + y[i] * values[2 * row + 1];
+                g[i] += w * along, h[i] += u * along;
+                for (int j = i; j < 3; j++) {
+                    double both = x[i] * x[j] + y[i] * y[j];
+                    v[3 * i + j] += w * both, p[3 * i + j] += u * both;
+                }
             }
         }
     }
