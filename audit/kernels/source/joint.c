@@ -13,22 +13,23 @@ static inline const double *rows_of(row_block block, int64_t view) {
     return block.base + (view - block.first_row) * 2 * block.width;
 }
 
-/* out (num, 2, ROWS): w J^T times chosen columns of the rows, through A (3, 2) of the own observation.
- * scores (num, width): w rows^T y~. */
+/* out (num, 2, ROWS): w J^T times chosen columns of the rows, through A (3, 2) of the own observation, less w where a view is
+ * that observation itself. scores (num, width): w rows^T y~.    first: row of the first own observation.    num_left: of views, with
+ * those that come later. */
 INLINE void crossed(
-    const joint_model *m, const int32_t *view, const int32_t *own, int64_t num, row_block block, int64_t column,
-    const double *absorbing, double *out, double *scores) {
+    const joint_model *m, const int32_t *view, const int32_t *own, int64_t num, int64_t num_left, int64_t first, row_block block,
+    int64_t column, const double *absorbing, double *out, double *scores) {
     int64_t count = block.width - column < ROWS ? block.width - column : ROWS;
     pair_of_rows pair = {{0.0}, {0.0}};
     for (int64_t k = 0; k < num; k++, out += 2 * ROWS) {
-        soon(m, view, k, num);
-        if (k + AHEAD < num) SOON(m->left + 2 * view[k + AHEAD]);
+        soon(m, view, k, num_left);
+        if (k + AHEAD < num_left) SOON(m->left + 2 * view[k + AHEAD]);
         const double *design = m->design + view[k] * 2 * m->width, *rows = rows_of(block, view[k]) + column;
         const double *a = absorbing + 6 * own[k], *jx = design + 3, *jy = design + m->width + 3;
-        double w = m->weight[view[k]];
+        double w = m->weight[view[k]], itself = view[k] == first + own[k] ? w : 0.0;
         /* J A (2, 2): what moving the point by A does to this view */
-        double xx = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]), xy = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
-        double yx = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), yy = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+        double xx = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]) - itself, xy = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+        double yx = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), yy = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]) - itself;
         if (count == ROWS) take_rows(rows, rows + block.width, ROWS, &pair);
         else take_rows(rows, rows + block.width, count, &pair);
         for (int c = 0; c < ROWS; c++) out[c] = pair.x[c] * xx + pair.y[c] * yx;
@@ -39,7 +40,7 @@ INLINE void crossed(
 }
 
 /* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. Scalars for one
- * row after the other, dense fields for four rows at a time: as many sums as there are registers. */
+ * row after the other, dense fields for two rows at a time: as many sums as there are registers. */
 INLINE void subtract_fields(
     const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
     double *out) {
@@ -73,40 +74,51 @@ INLINE void subtract_fields(
     }
 }
 
-enum { DEGREE = 8, MOMENTS = 48 }; /* 45 monomials of degree 0 .. 8, padded */
+enum {
+    DEGREE = 8,
+    MOMENTS = 48,               /* 45 monomials of degree 0 .. 8, padded */
+    OBSERVATIONS = 16, VIEWS = 32, /* so many at once: what they need fits the first cache */
+};
 
 /* Where x^a y^b stands among the moments: by degree, then by the power of y, as among the scalars. */
 static inline int moment_of(int a, int b) { return (a + b) * (a + b + 1) / 2 + b; }
 
 /* Sums of products of own fields with weights P (2, 2): half of E^T P E. Scalars times scalars are moments of the point. */
 typedef struct {
-    double xx[MOMENTS], xy[MOMENTS], yy[MOMENTS], plain[MOMENTS];
-    double xd[SCALAR][DENSE], yd[SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE][DENSE];
+    double moments[4][MOMENTS]; /* by P_xx, P_xy, P_yy, w */
+    double mixed[2][SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE][DENSE];
 } own_gram;
 
-INLINE void add_gram(
-    own_gram *g, const double *f, const double *d, double w, double pxx, double pxy, double pyy) {
-    double dx[DENSE], dy[DENSE], moment[MOMENTS] = {0.0};
-    for (int j = 0; j < SCALAR - 1; j++) moment[j] = f[j];
-    for (int degree = 5, k = 15; degree <= DEGREE; degree++, k++) {
-        for (int j = 0; j < degree; j++, k++) moment[k] = moment[k - degree] * f[1];
-        moment[k] = moment[k - degree - 1] * f[2];
+/* What add_gram needs of each of some observations. */
+typedef struct {
+    double moment[OBSERVATIONS][MOMENTS], p[OBSERVATIONS][4];
+    double by_p[OBSERVATIONS][2][DENSE], by_w[OBSERVATIONS][2][DENSE];
+} gram_parts;
+
+/* Add some observations, at most OBSERVATIONS: parts->p has P_xx, P_xy, P_yy and w of each. */
+INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *scalar, const double *dense) {
+    for (int64_t i = 0; i < num; i++) {
+        const double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i, *p = parts->p[i];
+        double *moment = parts->moment[i];
+        for (int j = 0; j < SCALAR - 1; j++) moment[j] = f[j];
+        for (int degree = 5, k = 15; degree <= DEGREE; degree++, k++) {
+            for (int j = 0; j < degree; j++, k++) moment[k] = moment[k - degree] * f[1];
+            moment[k] = moment[k - degree - 1] * f[2];
+        }
+        for (int j = 0; j < DENSE; j++) {
+            double x = d[j], y = d[DENSE + j];
+            parts->by_p[i][0][j] = p[0] * x + p[1] * y, parts->by_p[i][1][j] = p[1] * x + p[2] * y;
+            parts->by_w[i][0][j] = p[3] * x, parts->by_w[i][1][j] = p[3] * y;
+        }
     }
-    for (int j = 0; j < MOMENTS; j++) {
-        g->xx[j] += pxx * moment[j], g->xy[j] += pxy * moment[j], g->yy[j] += pyy * moment[j], g->plain[j] += w * moment[j];
+    add_products(4, MOMENTS / LANES, num, parts->p[0], 4, 1, parts->moment[0], MOMENTS, g->moments[0], MOMENTS);
+    for (int axis = 0; axis < 2; axis++) {
+        add_products(SCALAR, DENSE / LANES, num, scalar, SCALAR, 1, parts->by_p[0][axis], 2 * DENSE, g->mixed[axis][0], DENSE);
     }
-    for (int j = 0; j < DENSE; j++) {
-        double x = d[j], y = d[DENSE + j];
-        dx[j] = pxx * x + pxy * y, dy[j] = pxy * x + pyy * y;
-    }
-    for (int i = 0; i < SCALAR; i++) {
-        for (int j = 0; j < DENSE; j++) g->xd[i][j] += f[i] * dx[j];
-        for (int j = 0; j < DENSE; j++) g->yd[i][j] += f[i] * dy[j];
-    }
-    for (int i = 0; i < DENSE; i++) {
-        double x = w * d[i], y = w * d[DENSE + i];
-        for (int j = 0; j < DENSE; j++) g->dd[i][j] += d[i] * dx[j] + d[DENSE + i] * dy[j];
-        for (int j = i / LANES * LANES; j < DENSE; j++) g->dense_plain[i][j] += x * d[j] + y * d[DENSE + j];
+    for (int i = 0; i < DENSE; i += LANES) { /* at and right of the diagonal; both axes one behind the other */
+        int64_t vectors = (DENSE - i) / LANES;
+        add_products(LANES, vectors, 2 * num, dense + i, DENSE, 1, parts->by_p[0][0] + i, DENSE, g->dd[i] + i, DENSE);
+        add_products(LANES, vectors, 2 * num, dense + i, DENSE, 1, parts->by_w[0][0] + i, DENSE, g->dense_plain[i] + i, DENSE);
     }
 }
 
@@ -121,21 +133,23 @@ static void spread_gram(const own_gram *g, double *gram, double *plain, double *
     for (int i = 0; i < SCALAR - 1; i++) {
         for (int j = 0; j < SCALAR - 1; j++) {
             int k = moment_of(power_x[i] + power_x[j], power_y[i] + power_y[j]);
-            gram[i * FIELDS + j] = g->xx[k];
-            gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->xy[k];
-            gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->yy[k];
-            plain[i * SCALAR + j] = g->plain[k];
+            gram[i * FIELDS + j] = g->moments[0][k];
+            gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->moments[1][k];
+            gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->moments[2][k];
+            plain[i * SCALAR + j] = g->moments[3][k];
         }
     }
     for (int i = 0; i < SCALAR; i++) {
         for (int j = 0; j < DENSE; j++) {
-            gram[i * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + i] = g->xd[i][j];
-            gram[(SCALAR + i) * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + SCALAR + i] = g->yd[i][j];
+            gram[i * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + i] = g->mixed[0][i][j];
+            gram[(SCALAR + i) * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + SCALAR + i] = g->mixed[1][i][j];
         }
     }
     for (int i = 0; i < DENSE; i++) {
-        for (int j = 0; j < DENSE; j++) gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = g->dd[i][j];
-        for (int j = 0; j < DENSE; j++) dense_plain[i * DENSE + j] = i < j ? g->dense_plain[i][j] : g->dense_plain[j][i];
+        for (int j = 0; j < DENSE; j++) {
+            gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = i < j ? g->dd[i][j] : g->dd[j][i];
+            dense_plain[i * DENSE + j] = i < j ? g->dense_plain[i][j] : g->dense_plain[j][i];
+        }
     }
 }
 
@@ -175,6 +189,59 @@ static inline void absorb(const joint_model *m, int64_t row, double *a) {
     }
 }
 
+/* An image and its fields, see joint_first. */
+typedef struct {
+    int64_t first; /* of its rows */
+    const double *scalar, *dense;
+    const int32_t *track;
+    double *absorbing, *track_score;
+} own_fields;
+
+/* The rows of an image around: of its design, and of its included fields. */
+static inline void rows_of_image(const joint_model *m, int64_t image, row_block *out) {
+    int has_fields = m->extra_first[image] >= 0;
+    out[0] = (row_block){m->design, 0, m->width};
+    out[1] = (row_block){NULL, m->offsets[image], 0};
+    if (has_fields) out[1].base = m->extra + m->extra_first[image], out[1].width = m->extra_width[image];
+}
+
+/* What the own observations are by themselves: V^-1 J^T, Gram sums, scores. */
+INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, gram_parts *parts, own_gram *sums) {
+    for (int64_t from = 0; from < n; from += OBSERVATIONS) {
+        int64_t count = n - from < OBSERVATIONS ? n - from : OBSERVATIONS;
+        for (int64_t i = from; i < from + count; i++) {
+            int64_t row = o->first + i;
+            const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
+            double w = m->weight[row], *a = o->absorbing + 6 * i, *p = parts->p[i - from];
+            if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD]);
+            absorb(m, row, a);
+            p[0] = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
+            p[1] = -w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+            p[2] = w - w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+            p[3] = w;
+            double *score = o->track_score + FIELDS * (o->track[i] < 0 ? -1 - o->track[i] : o->track[i]);
+            if (o->track[i] >= 0) memset(score, 0, FIELDS * sizeof *score);
+            add_along(score, o->scalar + SCALAR * i, o->dense + 2 * DENSE * i, w * m->left[2 * row], w * m->left[2 * row + 1]);
+        }
+        add_gram(sums, parts, count, o->scalar + SCALAR * from, o->dense + 2 * DENSE * from);
+    }
+}
+
+/* gram less what own observations that show the same point have together: views of the image itself. */
+static void subtract_pairs(
+    const joint_model *m, const own_fields *o, const int32_t *view, const int32_t *own, int64_t num, double *gram) {
+    for (int64_t j = 0; j < num; j++) {
+        int64_t i = view[j] - o->first, l = own[j];
+        if (i >= l) continue;
+        const double *jx = m->design + view[j] * 2 * m->width + 3, *jy = jx + m->width, *a = o->absorbing + 6 * l;
+        double w = m->weight[view[j]], p[4];
+        p[0] = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]), p[1] = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
+        p[2] = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), p[3] = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
+        const double *fi = o->scalar + SCALAR * i, *di = o->dense + 2 * DENSE * i;
+        subtract_pair(gram, fi, di, o->scalar + SCALAR * l, o->dense + 2 * DENSE * l, p);
+    }
+}
+
 /* What an image's candidate fields are to the base, before S^+ (first half of candidate_scores).
  *
  * scalar (n_i, SCALAR), dense (n_i, 2, DENSE): its fields: SCALAR functions in x, the same in y, DENSE with both.
@@ -190,82 +257,84 @@ WIDE int64_t joint_first(
     int64_t num_tracks, int64_t max_rows, int32_t *view, int32_t *own, int64_t *around, int64_t *start,
     int64_t *num, double *absorbing, double *right, double *gram, double *plain, double *dense_plain, double *score,
     double *track_score, double *scores, int64_t max_scores) {
-    int64_t first = m->offsets[image], last = m->offsets[image + 1], n = last - first;
+    int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, rows = 0, used = 0;
+    own_fields o = {first, scalar, dense, track, absorbing, track_score};
     surroundings near = {view, own, around, start, 0, 0};
-    collect(m, first, last, 0, place, &near);
-    int64_t most = 1;
-    for (int64_t k = 0; k < near.num_images; k++) most = start[k + 1] - start[k] > most ? start[k + 1] - start[k] : most;
-    double *through = malloc((size_t)most * 2 * ROWS * sizeof *through);
+    collect(m, first, first + n, 0, place, &near);
+    num[0] = near.num_images;
+    for (int64_t k = 0; k < near.num_images; k++) {
+        row_block blocks[2];
+        rows_of_image(m, around[k], blocks);
+        rows += blocks[0].width + blocks[1].width, used += (start[k + 1] - start[k]) * (blocks[0].width + blocks[1].width);
+    }
+    num[1] = rows;
+    if (rows > max_rows || used > max_scores) return NEEDS_NUMPY;
     own_gram *sums = calloc(1, sizeof *sums);
-    if (!through || !sums) {
-        free(through), free(sums);
+    gram_parts *parts = calloc(1, sizeof *parts);
+    if (!sums || !parts) {
+        free(sums), free(parts);
         return NO_MEMORY;
     }
-    memset(track_score, 0, (size_t)num_tracks * FIELDS * sizeof *track_score);
+    add_own(m, &o, n, parts, sums);
     memset(score, 0, FIELDS * sizeof *score);
-    for (int64_t i = 0; i < n; i++) {
-        const double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i;
-        const double *jx = m->design + (first + i) * 2 * m->width + 3, *jy = jx + m->width;
-        double w = m->weight[first + i], *a = absorbing + 6 * i;
-        if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[first + i + AHEAD]);
-        absorb(m, first + i, a);
-        double pxx = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
-        double pxy = -w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
-        double pyy = w - w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
-        add_gram(sums, f, d, w, pxx, pxy, pyy);
-        int64_t t = track[i] < 0 ? -1 - track[i] : track[i];
-        add_along(track_score + FIELDS * t, f, d, w * m->left[2 * (first + i)], w * m->left[2 * (first + i) + 1]);
-    }
     for (int64_t t = 0; t < num_tracks; t++) {
         for (int c = 0; c < FIELDS; c++) score[c] += track_score[t * FIELDS + c];
     }
     spread_gram(sums, gram, plain, dense_plain);
-    int64_t rows = 0, used = 0, status = DONE;
-    for (int64_t k = 0; k < near.num_images && status == DONE; k++) {
-        int64_t other = around[k], begin = start[k], count = start[k + 1] - begin;
-        row_block blocks[2] = {{m->design, 0, m->width}, {NULL, m->offsets[other], 0}};
-        if (m->extra_first[other] >= 0) {
-            blocks[1].base = m->extra + m->extra_first[other], blocks[1].width = m->extra_width[other];
-        }
-        used += count * (blocks[0].width + blocks[1].width);
-        if (rows + blocks[0].width + blocks[1].width > max_rows || used > max_scores) {
-            status = NEEDS_NUMPY;
-            break;
-        }
+    memset(right, 0, (size_t)(rows * FIELDS) * sizeof *right);
+    for (int64_t k = 0; k < near.num_images; k++) {
+        int64_t begin = start[k], count = start[k + 1] - begin;
+        row_block blocks[2];
+        rows_of_image(m, around[k], blocks);
         for (int b = 0; b < 2; b++) {
-            double *to = right + rows * FIELDS;
-            memset(to, 0, (size_t)blocks[b].width * FIELDS * sizeof *to);
-            for (int64_t column = 0; column < blocks[b].width; column += ROWS) {
-                int64_t wide_count = blocks[b].width - column < ROWS ? blocks[b].width - column : ROWS;
-                crossed(m, view + begin, own + begin, count, blocks[b], column, absorbing, through, scores);
-                subtract_fields(own + begin, count, wide_count, through, scalar, dense, to + column * FIELDS);
-            }
-            scores += count * blocks[b].width;
-            if (other == image) {
-                for (int64_t i = 0; i < n; i++) {
-                    const double *r = rows_of(blocks[b], first + i);
-                    double w = m->weight[first + i];
-                    for (int64_t c = 0; c < blocks[b].width; c++) {
-                        add_along(to + c * FIELDS, scalar + SCALAR * i, dense + 2 * DENSE * i, w * r[c], w * r[blocks[b].width + c]);
-                    }
+            int64_t width = blocks[b].width;
+            for (int64_t column = 0; column < width; column += ROWS) {
+                int64_t num_columns = width - column < ROWS ? width - column : ROWS;
+                for (int64_t v = 0; v < count; v += VIEWS) {
+                    int64_t here = begin + v, num_views = count - v < VIEWS ? count - v : VIEWS;
+                    double through[VIEWS * 2 * ROWS];
+                    crossed(
+                        m, view + here, own + here, num_views, near.num_views - here, first, blocks[b], column, absorbing, through,
+                        scores + v * width);
+                    subtract_fields(own + here, num_views, num_columns, through, scalar, dense, right + column * FIELDS);
                 }
             }
-            rows += blocks[b].width;
+            scores += count * width, right += width * FIELDS;
         }
-        for (int64_t j = begin; other == image && j < start[k + 1]; j++) {
-            int64_t i = view[j] - first, l = own[j]; /* another own row that shows the same point */
-            if (i < l) {
-                const double *jx = m->design + view[j] * 2 * m->width + 3, *jy = jx + m->width, *a = absorbing + 6 * l;
-                double w = m->weight[view[j]], p[4];
-                p[0] = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]), p[1] = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
-                p[2] = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), p[3] = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]);
-                subtract_pair(gram, scalar + SCALAR * i, dense + 2 * DENSE * i, scalar + SCALAR * l, dense + 2 * DENSE * l, p);
-            }
+        if (around[k] == image) subtract_pairs(m, &o, view + begin, own + begin, count, gram);
+    }
+    free(sums), free(parts);
+    return DONE;
+}
+
+/* Some vectors of up to four views, from number v on: see subtract_scores. */
+INLINE void subtract_some(int rows, int vectors, double *const *to, int v, int64_t width, const double *scores, const double *moved) {
+    wide sum[4][3];
+    for (int i = 0; i < rows; i++) {
+        for (int u = 0; u < vectors; u++) sum[i][u] = LOAD(to[i] + v + LANES * u);
+    }
+    for (int64_t c = 0; c < width; c++) {
+        for (int i = 0; i < rows; i++) {
+            double x = scores[i * width + c];
+            wide h = {x, x, x, x};
+            for (int u = 0; u < vectors; u++) sum[i][u] -= h * LOAD(moved + c * FIELDS + v + LANES * u);
         }
     }
-    num[0] = near.num_images, num[1] = rows;
-    free(through), free(sums);
-    return status;
+    for (int i = 0; i < rows; i++) {
+        for (int u = 0; u < vectors; u++) STORE(to[i] + v + LANES * u) = sum[i][u];
+    }
+}
+
+/* to (FIELDS) of each of up to four views -= its scores (width) times moved (width, FIELDS). */
+INLINE void subtract_scores(double *const *to, int64_t count, int64_t width, const double *scores, const double *moved) {
+    if (count == 4) {
+        for (int v = 0; v < 9 * LANES; v += 3 * LANES) subtract_some(4, 3, to, v, width, scores, moved);
+        subtract_some(4, 2, to, 9 * LANES, width, scores, moved);
+    } else {
+        for (int64_t i = 0; i < count; i++) {
+            for (int v = 0; v < FIELDS; v += LANES) subtract_some(1, 1, to + i, v, width, scores + i * width, moved);
+        }
+    }
 }
 
 /* The scores of the tracks minus what the base does with them (second half of candidate_scores), in place.
@@ -274,26 +343,20 @@ WIDE int64_t joint_first(
 WIDE int64_t joint_second(
     const joint_model *m, int64_t num_around, const int32_t *own, const int64_t *around, const int64_t *start,
     const int32_t *track, const double *scores, const double *moved, double *track_score) {
+    double unused[FIELDS] = {0.0}; /* where a track had this view already */
     for (int64_t k = 0; k < num_around; k++) {
         int64_t widths[2] = {m->width, m->extra_first[around[k]] >= 0 ? m->extra_width[around[k]] : 0};
         for (int b = 0; b < 2; b++) {
             int64_t width = widths[b];
-            for (int64_t j = start[k]; width && j < start[k + 1]; j++, scores += width) {
-                if (track[own[j]] < 0) continue; /* the track had this view already */
-                double *to = track_score + FIELDS * track[own[j]];
-                wide s0 = LOAD(to), s1 = LOAD(to + 4), s2 = LOAD(to + 8), s3 = LOAD(to + 12), s4 = LOAD(to + 16);
-                wide s5 = LOAD(to + 20), s6 = LOAD(to + 24), s7 = LOAD(to + 28), s8 = LOAD(to + 32), s9 = LOAD(to + 36);
-                wide s10 = LOAD(to + 40);
-                for (int64_t c = 0; c < width; c++) {
-                    const double *from = moved + c * FIELDS;
-                    wide h = {scores[c], scores[c], scores[c], scores[c]};
-                    s0 -= h * LOAD(from), s1 -= h * LOAD(from + 4), s2 -= h * LOAD(from + 8), s3 -= h * LOAD(from + 12);
-                    s4 -= h * LOAD(from + 16), s5 -= h * LOAD(from + 20), s6 -= h * LOAD(from + 24), s7 -= h * LOAD(from + 28);
-                    s8 -= h * LOAD(from + 32), s9 -= h * LOAD(from + 36), s10 -= h * LOAD(from + 40);
+            for (int64_t j = start[k]; width && j < start[k + 1];) {
+                double *to[4];
+                int64_t count = start[k + 1] - j < 4 ? start[k + 1] - j : 4;
+                for (int64_t i = 0; i < count; i++) {
+                    if (i && own[j + i] == own[j + i - 1]) count = i; /* the same track: after those before it */
+                    else to[i] = track[own[j + i]] < 0 ? unused : track_score + FIELDS * track[own[j + i]];
                 }
-                STORE(to) = s0, STORE(to + 4) = s1, STORE(to + 8) = s2, STORE(to + 12) = s3, STORE(to + 16) = s4;
-                STORE(to + 20) = s5, STORE(to + 24) = s6, STORE(to + 28) = s7, STORE(to + 32) = s8, STORE(to + 36) = s9;
-                STORE(to + 40) = s10;
+                subtract_scores(to, count, width, scores, moved);
+                j += count, scores += count * width;
             }
             moved += width * FIELDS;
         }

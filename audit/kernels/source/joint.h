@@ -95,6 +95,50 @@ typedef struct {
     double x[MOST_COLUMNS], y[MOST_COLUMNS];
 } pair_of_rows;
 
+/* out (rows, 4 vectors) += sum over k of left[k] (rows) times right[k] (4 vectors): at most four rows and three vectors, whose
+ * sums stay in registers. Numbers of left are `across` apart, one k after the other `next`. */
+INLINE void add_few_products(
+    int rows, int vectors, int64_t num, const double *left, int64_t next, int64_t across, const double *right, int64_t right_next,
+    double *out, int64_t out_next) {
+    wide sum[4][3];
+    for (int i = 0; i < rows; i++) {
+        for (int v = 0; v < vectors; v++) sum[i][v] = LOAD(out + out_next * i + LANES * v);
+    }
+    for (int64_t k = 0; k < num; k++, left += next, right += right_next) {
+        for (int i = 0; i < rows; i++) {
+            double x = left[across * i];
+            wide f = {x, x, x, x};
+            for (int v = 0; v < vectors; v++) sum[i][v] += f * LOAD(right + LANES * v);
+        }
+    }
+    for (int i = 0; i < rows; i++) {
+        for (int v = 0; v < vectors; v++) STORE(out + out_next * i + LANES * v) = sum[i][v];
+    }
+}
+
+/* The same of any number of rows and vectors. */
+INLINE void add_products(
+    int64_t rows, int64_t vectors, int64_t num, const double *left, int64_t next, int64_t across, const double *right,
+    int64_t right_next, double *out, int64_t out_next) {
+    int64_t i = 0;
+    for (; i + 4 <= rows; i += 4) {
+        int64_t v = 0;
+        for (; v + 3 <= vectors; v += 3) {
+            add_few_products(4, 3, num, left + across * i, next, across, right + LANES * v, right_next, out + out_next * i + LANES * v, out_next);
+        }
+        if (v + 2 == vectors) {
+            add_few_products(4, 2, num, left + across * i, next, across, right + LANES * v, right_next, out + out_next * i + LANES * v, out_next);
+        } else if (v + 1 == vectors) {
+            add_few_products(4, 1, num, left + across * i, next, across, right + LANES * v, right_next, out + out_next * i + LANES * v, out_next);
+        }
+    }
+    for (; i < rows; i++) {
+        for (int64_t v = 0; v < vectors; v++) {
+            add_few_products(1, 1, num, left + across * i, next, across, right + LANES * v, right_next, out + out_next * i + LANES * v, out_next);
+        }
+    }
+}
+
 INLINE void take_rows(
     const double *x, const double *y, int64_t count, pair_of_rows *out) {
     for (int64_t c = 0; c < count; c++) out->x[c] = x[c], out->y[c] = y[c];

@@ -36,20 +36,6 @@ INLINE void add_row(double *out, double x, const double *from) {
     for (int v = 0; v < VECTORS; v++) STORE(out + LANES * v) += f * LOAD(from + LANES * v);
 }
 
-/* out (rows, FIELDS) += entries (rows, TILE) times from (columns, FIELDS). */
-INLINE void add_product(int64_t rows, int64_t columns, const double *entries, const double *from, double *out) {
-    for (int64_t i = 0; i < rows; i++) {
-        wide sum[VECTORS];
-        for (int v = 0; v < VECTORS; v++) sum[v] = LOAD(out + FIELDS * i + LANES * v);
-        for (int64_t j = 0; j < columns; j++) {
-            double x = entries[TILE * i + j];
-            wide f = {x, x, x, x};
-            for (int v = 0; v < VECTORS; v++) sum[v] += f * LOAD(from + FIELDS * j + LANES * v);
-        }
-        for (int v = 0; v < VECTORS; v++) STORE(out + FIELDS * i + LANES * v) = sum[v];
-    }
-}
-
 /* Entries of Y at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. */
 INLINE int entries_of(
     const base_inverse *s, const keyed *key, int64_t first_row, int64_t rows, int64_t first_column, int64_t columns, double *out) {
@@ -85,7 +71,7 @@ static inline __attribute__((always_inline)) int times_inverse(
     for (int64_t i = 0; i < inner; i += TILE) {
         int64_t rows = inner - i < TILE ? inner - i : TILE;
         for (int64_t j = i; j < inner; j += TILE) {
-            double tile[TILE * TILE], turned[TILE * TILE];
+            double tile[TILE * TILE];
             int64_t columns = inner - j < TILE ? inner - j : TILE;
             if (!entries_of(s, key, i, rows, j, columns, tile)) return 0;
             if (i == j) {
@@ -93,12 +79,9 @@ static inline __attribute__((always_inline)) int times_inverse(
                     for (int64_t b = 0; b < a; b++) tile[TILE * a + b] = tile[TILE * b + a];
                 }
             } else {
-                for (int64_t a = 0; a < rows; a++) {
-                    for (int64_t b = 0; b < columns; b++) turned[TILE * b + a] = tile[TILE * a + b];
-                }
-                add_product(columns, rows, turned, scaled + FIELDS * i, out + FIELDS * j);
+                add_products(columns, VECTORS, rows, tile, TILE, 1, scaled + FIELDS * i, FIELDS, out + FIELDS * j, FIELDS);
             }
-            add_product(rows, columns, tile, scaled + FIELDS * j, out + FIELDS * i);
+            add_products(rows, VECTORS, columns, tile, 1, TILE, scaled + FIELDS * j, FIELDS, out + FIELDS * i, FIELDS);
         }
     }
     for (int64_t k = 0; !s->dense && k < s->num_outer; k++) {
@@ -141,38 +124,13 @@ static inline __attribute__((always_inline)) void add_included(
     }
 }
 
-/* The last `num` vectors of row a of out (FIELDS, FIELDS) += sign times left^T right, rows first <= t < last. */
-INLINE void add_row_of_products(
-    int num, int64_t first, int64_t last, int64_t a, const double *left, const double *right, double sign, double *out) {
-    wide sum[VECTORS] = {{0}}, by = {sign, sign, sign, sign};
-    const double *from = right + FIELDS - LANES * num;
-    double *to = out + FIELDS * (a + 1) - LANES * num;
-    for (int64_t t = first; t < last; t++) {
-        double x = left[FIELDS * t + a];
-        wide f = {x, x, x, x};
-        for (int v = 0; v < num; v++) sum[v] += f * LOAD(from + FIELDS * t + LANES * v);
-    }
-    for (int v = 0; v < num; v++) STORE(to + LANES * v) += by * sum[v];
-}
-
-/* out (FIELDS, FIELDS) += sign times left^T right, both (num, FIELDS), at and right of the diagonal: it is symmetric. */
-INLINE void add_products(int64_t num, const double *left, const double *right, double sign, double *out) {
+/* out (FIELDS, FIELDS) += left^T right, both (num, FIELDS), at and right of the diagonal, four rows at a time. */
+INLINE void add_symmetric(int64_t num, const double *left, const double *right, double *out) {
     for (int64_t first = 0; first < num; first += TRACKS_AT_ONCE) {
-        int64_t last = first + TRACKS_AT_ONCE < num ? first + TRACKS_AT_ONCE : num;
-        for (int64_t a = 0; a < FIELDS; a++) {
-            switch (VECTORS - a / LANES) { /* so that the sums stay in registers */
-            case 11: add_row_of_products(11, first, last, a, left, right, sign, out); break;
-            case 10: add_row_of_products(10, first, last, a, left, right, sign, out); break;
-            case 9: add_row_of_products(9, first, last, a, left, right, sign, out); break;
-            case 8: add_row_of_products(8, first, last, a, left, right, sign, out); break;
-            case 7: add_row_of_products(7, first, last, a, left, right, sign, out); break;
-            case 6: add_row_of_products(6, first, last, a, left, right, sign, out); break;
-            case 5: add_row_of_products(5, first, last, a, left, right, sign, out); break;
-            case 4: add_row_of_products(4, first, last, a, left, right, sign, out); break;
-            case 3: add_row_of_products(3, first, last, a, left, right, sign, out); break;
-            case 2: add_row_of_products(2, first, last, a, left, right, sign, out); break;
-            default: add_row_of_products(1, first, last, a, left, right, sign, out); break;
-            }
+        int64_t count = num - first < TRACKS_AT_ONCE ? num - first : TRACKS_AT_ONCE;
+        for (int64_t a = 0; a < FIELDS; a += LANES) {
+            const double *l = left + FIELDS * first + a, *r = right + FIELDS * first + a;
+            add_products(LANES, (FIELDS - a) / LANES, count, l, FIELDS, 1, r, FIELDS, out + FIELDS * a + a, FIELDS);
         }
     }
 }
@@ -338,9 +296,10 @@ WIDE KERNEL int64_t joint_scores(
         add_included(s, w.column, count[0], count[1], w.ordered, w.solution);
         spread_columns(m, s, &w, found[0], found[1]);
         joint_second(m, found[0], w.own, w.around, w.start, w.track, w.scores, w.moved, w.track_score);
-        add_products(count[0] + count[1], w.ordered, w.solution, -1.0, g);
         memset(v, 0, FIELDS * FIELDS * sizeof *v);
-        add_products(num_tracks[k], w.track_score, w.track_score, 1.0, v);
+        add_symmetric(count[0] + count[1], w.ordered, w.solution, v);
+        for (int64_t a = 0; a < FIELDS * FIELDS; a++) g[a] -= v[a], v[a] = 0.0;
+        add_symmetric(num_tracks[k], w.track_score, w.track_score, v);
         for (int64_t a = 0; a < FIELDS; a++) {
             for (int64_t b = 0; b < a; b++) g[FIELDS * a + b] = g[FIELDS * b + a], v[FIELDS * a + b] = v[FIELDS * b + a];
         }
