@@ -11,6 +11,7 @@ from scipy.sparse import linalg as sparse_linalg
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.matrix import operator_of
 from sfm_audit.audit.joint.normal import point_steps, reduced_systems
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
 from sfm_audit.audit.joint.own import CameraStep
@@ -116,7 +117,9 @@ def _next(system: JointSystem, model: SparseModel, residuals: ModelResiduals) ->
     reduced, _ = reduced_systems(observations)
     inverse = system.base.inverse
     front = sparse_linalg.LinearOperator(reduced.matrix.shape, matvec=inverse.main.apply)
-    step, _ = sparse_linalg.cg(reduced.matrix, reduced.right, M=front, rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS)
+    step, _ = sparse_linalg.cg(
+        operator_of(reduced.matrix), reduced.right, M=front, rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS
+    )
     left = observations.residuals_px()
     padded = np.append(step, 0.0)
     for image in observations.used_images:

@@ -7,101 +7,20 @@ everything, as the parameters of a camera that all images share, is eliminated l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy import sparse
 from scipy.linalg import blas, lapack, qr
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from sfm_audit.audit.joint.band import Band, band_blocks
+from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import near_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
-_MIN_BLOCKS: Final = 4  # fewer are no band
-_FAR_REACHING: Final = (8, 4, 2)  # times as many couplings as a column commonly has: it belongs to the border
-_MAX_BORDER: Final = 128
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Band:
-    """How the columns of a sparse symmetric matrix are ordered into blocks that couple with the next one only.
-
-    order: (D,) column at each place.    place: (D,) of each column.    width: how far places couple.
-    starts: (b + 1,) where each block begins and the last one ends, none longer than the width; the border behind them
-    couples with everything.
-    """
-
-    order: IntArray
-    place: IntArray
-    width: int
-    starts: IntArray
-
-    @property
-    def num_banded(self) -> int:
-        """Places of the band."""
-        return int(self.starts[-1])
-
-    def blocks(self) -> Iterator[slice]:
-        """Places of each block."""
-        for start, stop in pairwise(self.starts.tolist()):
-            yield slice(start, stop)
-
-    def number(self, place: IntArray) -> IntArray:
-        """Which block has each of some places; one behind the last for the border."""
-        return np.asarray(np.searchsorted(self.starts, place, side="right") - 1)
-
-    @property
-    def num_border(self) -> int:
-        """Columns of the border."""
-        return len(self.order) - self.num_banded
-
-
-def band_of(matrix: sparse.csr_array) -> Band | None:
-    """Order the columns (reverse Cuthill-McKee), far reaching ones in a border; None where no band is worth it."""
-    couplings = np.diff(matrix.indptr)
-    common = np.median(couplings) if couplings.size else 0.0
-    borders = {0: np.zeros(0, dtype=np.int64)}
-    for times in _FAR_REACHING:
-        border = np.flatnonzero(couplings > times * common)
-        if border.size <= _MAX_BORDER:
-            borders.setdefault(border.size, border)
-    bands = [_ordered(matrix, border) for border in borders.values()]
-    worth = [band for band in bands if band.num_banded >= _MIN_BLOCKS * band.width]
-    return min(worth, key=lambda band: band.width + band.num_border) if worth else None
-
-
-def _ordered(matrix: sparse.csr_array, border: IntArray) -> Band:
-    """The band that is left when some columns are its border."""
-    size = matrix.shape[0]
-    inner = np.delete(np.arange(size), border)
-    within = matrix[inner][:, inner] if border.size else matrix
-    order = np.append(inner[reverse_cuthill_mckee(within, symmetric_mode=True)], border).astype(np.int64)
-    place = np.empty(size, dtype=np.int64)
-    place[order] = np.arange(size)
-    by_row = place[inner].astype(np.int32)
-    reach, used = np.arange(inner.size), np.flatnonzero(np.diff(within.indptr))
-    furthest = np.maximum.reduceat(by_row[within.indices], within.indptr[used]) if used.size else by_row[used]
-    reach[by_row[used]] = np.maximum(reach[by_row[used]], furthest)
-    width = max(int((reach - np.arange(inner.size)).max(initial=0)), 1)
-    return Band(order, place, width, _starts(reach, width))
-
-
-def _starts(reach: IntArray, width: int) -> IntArray:
-    """Blocks as short as can be when each ends behind all that the one before it couples with, or half a width long.
-
-    reach : (n,) last place that each place couples with
-    """
-    behind = np.maximum.accumulate(reach) + 1
-    starts = [0]
-    while starts[-1] < reach.size:
-        here = starts[-1]
-        starts.append(min(max(int(behind[max(here - 1, 0)]), here + (width + 1) // 2), reach.size))
-    return np.array(starts, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,51 +77,45 @@ def _triangular(lower: FloatArray, right: FloatArray, *, transposed: bool) -> Fl
     return np.asarray(blas.dtrsm(1.0, lower, right.T, side=1, lower=1, trans_a=int(not transposed))).T
 
 
-def banded_factor(matrix: sparse.csr_array, band: Band, null: FloatArray) -> BandedFactor | None:
-    """Factor S (D, D), unit diagonal; None where S + F F^T is not positive definite.
+def banded_factor(matrix: Symmetric, band: Band, null: FloatArray, inverse_scale: FloatArray) -> BandedFactor | None:
+    """Factor S (D, D) in units of unit diagonal; None where S + F F^T is not positive definite.
 
     Parameters
     ----------
     null : (D, g) orthonormal, directions that S leaves free
+    inverse_scale : (D,) 1 / D of each column; zero for dead ones, of which nothing but the diagonal stays
 
     Notes
     -----
     F: the g rows at which the null directions differ most (pivoted QR of G^T); one for each, or X were no inverse of S.
     """
-    ordered = matrix[band.order][:, band.order]
+    diagonal, coupled, columns = band_blocks(matrix, band, inverse_scale)
     free = null[band.order]
-    pinned = np.empty(0, dtype=np.int64)
+    added = (inverse_scale == 0)[band.order].astype(np.float64)
     if free.shape[1]:
-        pinned = np.sort(qr(free.T, mode="r", pivoting=True)[1][: free.shape[1]]).astype(np.int64)
-    diagonal: list[FloatArray] = []
+        added[qr(free.T, mode="r", pivoting=True)[1][: free.shape[1]]] += 1.0
     below: list[FloatArray] = []
-    blocks = list(band.blocks())
-    for i, own in enumerate(blocks):
-        block = ordered[own, own].toarray()
-        here = pinned[(pinned >= own.start) & (pinned < own.stop)] - own.start
-        block[here, here] += 1.0
+    for i, own in enumerate(band.blocks()):
+        block = diagonal[i]
+        np.einsum("ii->i", block)[...] += added[own]
         if i:
             block -= below[-1] @ below[-1].T
-        lower, info = lapack.dpotrf(block, lower=1, clean=1)
+        lower, info = lapack.dpotrf(block.T, lower=1, clean=1, overwrite_a=1)  # symmetric: in its own memory
         if info:
             return None
-        diagonal.append(lower)
-        if i + 1 < len(blocks):
-            coupled = ordered[blocks[i + 1], own].toarray()
-            below.append(np.ascontiguousarray(_triangular(lower, coupled.T, transposed=False).T))
+        diagonal[i] = lower
+        if i < len(coupled):
+            below.append(np.ascontiguousarray(_triangular(lower, coupled[i].T, transposed=False).T))
     nothing = np.zeros((len(free), 0))
     factor = BandedFactor(band, diagonal, below, free, nothing, nothing[:0])
-    return _with_border(factor, ordered, pinned) if band.num_border else factor
+    return _with_border(factor, columns, added[band.num_banded :]) if band.num_border else factor
 
 
-def _with_border(factor: BandedFactor, ordered: sparse.csr_array, pinned: IntArray) -> BandedFactor | None:
-    """The factor of a band with its border, eliminated last."""
+def _with_border(factor: BandedFactor, columns: FloatArray, added: FloatArray) -> BandedFactor | None:
+    """The factor of a band with its border, eliminated last: columns (D, m), ``added`` (m,) to the diagonal."""
     start, count = factor.band.num_banded, factor.band.num_border
-    columns = ordered[:, start:].toarray()
     beside = factor.solve_band(columns)
-    schur = columns[start:] - columns[:start].T @ beside[:start]
-    here = pinned[pinned >= start] - start
-    schur[here, here] += 1.0
+    schur = columns[start:] - columns[:start].T @ beside[:start] + np.diag(added)
     lower, info = lapack.dpotrf(0.5 * (schur + schur.T), lower=1, clean=1)
     if info:
         return None
@@ -265,21 +178,13 @@ class BandedInverse:
 
     def blocks(self, columns: IntArray) -> FloatArray:
         """(B, k, k) entries of S^+ at columns (B, k)."""
-        place, band = self.factor.band.place[columns], self.factor.band
-        lower = np.minimum(place[:, :, None], place[:, None, :])
-        higher = np.maximum(place[:, :, None], place[:, None, :])
-        starts, sizes = _places_in_flat(self.near)
-        in_band = higher < band.num_banded
-        number = np.where(in_band, band.number(lower), 0)
-        origin = band.starts[number]
-        too_far = in_band & (higher - origin >= sizes[number])
-        at = starts[number] + (lower - origin) * sizes[number] + higher - origin
-        out = np.where(in_band, self.flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
+        place = self.factor.band.place[columns]
+        out, too_far = entries_at(self.factor.band, self.flat, self.near, place)
         outer = self.aside[place] @ self.pull[place].swapaxes(1, 2)
         out -= outer + outer.swapaxes(1, 2)
         scale = self.inverse_scale[columns]
         out *= scale[:, None, :] * scale[:, :, None]
-        for k in np.flatnonzero(too_far.any(axis=(1, 2))).tolist():
+        for k in np.flatnonzero(too_far).tolist():
             out[k] = self.block(columns[k])
         return np.asarray(out)
 
@@ -324,6 +229,31 @@ def _places_in_flat(near: list[FloatArray]) -> tuple[IntArray, IntArray]:
     return np.concatenate([[0], np.cumsum(sizes)]), np.array([block.shape[1] for block in near], dtype=np.int64)
 
 
+def entries_at(band: Band, flat: FloatArray, near: list[FloatArray], place: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return entries (B, k, k) at places (B, k) of what ``near`` has of a symmetric matrix, zero in the border.
+
+    near: per block its rows at the columns from its first one on; views of ``flat``, where one follows the other.
+    The second answer says (B,) where not all entries are at hand.
+    """
+    lower = np.minimum(place[:, :, None], place[:, None, :])
+    higher = np.maximum(place[:, :, None], place[:, None, :])
+    starts, sizes = _places_in_flat(near)
+    in_band = higher < band.num_banded
+    number = np.where(in_band, band.number(lower), 0)
+    origin = band.starts[number]
+    too_far = in_band & (higher - origin >= sizes[number])
+    at = starts[number] + (lower - origin) * sizes[number] + higher - origin
+    out = np.where(in_band, flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
+    return np.asarray(out), np.asarray(too_far.any(axis=(1, 2)))
+
+
+def near_room(shapes: list[tuple[int, int]]) -> tuple[FloatArray, list[FloatArray]]:
+    """Return room for one block after the other, in one piece and as blocks."""
+    ends = np.cumsum([rows * columns for rows, columns in shapes])
+    flat = np.empty(int(ends[-1]))
+    return flat, [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
+
+
 def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInverse:
     """Return S^+ in the units of the matrix.
 
@@ -337,9 +267,7 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     shapes = [
         (own.stop - own.start, end - own.start) for own, end in zip(factor.band.blocks(), ends_of_reach, strict=False)
     ]
-    ends = np.cumsum([rows * columns for rows, columns in shapes])
-    flat = np.empty(int(ends[-1]))
-    near = [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
+    flat, near = near_room(shapes)
     for i in range(len(factor.diagonal) - 1, -1, -1):
         own, _ = lapack.dpotri(factor.diagonal[i], lower=1)
         own = np.tril(own) + np.tril(own, -1).T

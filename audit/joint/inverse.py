@@ -9,7 +9,9 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from sfm_audit.audit.joint.banded import Band, BandedFactor, band_of, banded_factor, banded_inverse
+from sfm_audit.audit.joint.band import Band, band_of
+from sfm_audit.audit.joint.banded import BandedFactor, banded_factor, banded_inverse
+from sfm_audit.audit.joint.matrix import Symmetric, csr_of
 from sfm_audit.audit.kernels.joint_parts import dense_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -168,7 +170,7 @@ class JointInverse:
         return replace(self, update=np.hstack([self.update, head]), border=border, corner=corner)
 
 
-def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArray) -> JointInverse:
+def joint_inverse(matrix: Symmetric, before: FloatArray, gauge: FloatArray) -> JointInverse:
     """Invert S (D, D) off its null directions.
 
     Parameters
@@ -191,11 +193,11 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
     free = _orthonormal(gauge, scale, dead, matrix)
     rounding = np.where(dead, 0.0, np.sqrt(np.where(dead, 1.0, before)) / scale)
-    scaled = _scaled(matrix, scale, dead)
-    band = band_of(scaled)
+    inverse_scale = np.where(dead, 0.0, 1.0 / scale)
+    band = band_of(matrix)
     deflated, further = free, free[:, :0]
     while True:
-        factor = _factor(scaled, deflated, band)
+        factor = _factor(matrix, inverse_scale, deflated, band)
         found = _null_directions(factor, rounding)
         if not found.shape[1]:
             break
@@ -203,7 +205,6 @@ def joint_inverse(matrix: sparse.csr_array, before: FloatArray, gauge: FloatArra
         deflated = np.hstack([deflated, found])
         if further.shape[1] >= _MAX_NULL:
             break
-    inverse_scale = np.where(dead, 0.0, 1.0 / scale)
     lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
     main: SymmetricInverse
     if isinstance(factor, BandedFactor):
@@ -228,15 +229,11 @@ class _DenseFactor:
         return np.asarray(out - self.deflated @ (self.deflated.T @ out))
 
 
-def _scaled(matrix: sparse.csr_array, scale: FloatArray, dead: BoolArray) -> sparse.csr_array:
+def _scaled(matrix: sparse.csr_array, inverse_scale: FloatArray) -> sparse.csr_array:
     """S with unit diagonal; of dead columns nothing but that."""
-    data = matrix.data / scale[matrix.indices] / np.repeat(scale, np.diff(matrix.indptr))
-    if dead.any():
-        row = np.repeat(np.arange(len(dead)), np.diff(matrix.indptr))
-        data = np.where(dead[row] | dead[matrix.indices], np.where(row == matrix.indices, 1.0, 0.0), data)
-    out = sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
-    missing = dead & (out.diagonal() == 0)
-    return sparse.csr_array(out + sparse.diags_array(missing.astype(np.float64))) if missing.any() else out
+    scaled = sparse.diags_array(inverse_scale) @ matrix @ sparse.diags_array(inverse_scale)
+    dead = inverse_scale == 0
+    return sparse.csr_array(scaled + sparse.diags_array(dead.astype(np.float64)) if dead.any() else scaled)
 
 
 def _dense(scaled: sparse.csr_array, deflated: FloatArray) -> FloatArray:
@@ -254,9 +251,11 @@ def _add_outer(out: FloatArray, columns: FloatArray, sign: float) -> None:
         out[:, part] += sign * (columns @ columns[part].T)
 
 
-def _factor(scaled: sparse.csr_array, deflated: FloatArray, band: Band | None) -> BandedFactor | _DenseFactor:
-    banded = banded_factor(scaled, band, deflated) if band else None
-    return banded or _dense_factor(scaled, deflated)
+def _factor(
+    matrix: Symmetric, inverse_scale: FloatArray, deflated: FloatArray, band: Band | None
+) -> BandedFactor | _DenseFactor:
+    banded = banded_factor(matrix, band, deflated, inverse_scale) if band else None
+    return banded or _dense_factor(_scaled(csr_of(matrix), inverse_scale), deflated)
 
 
 def _dense_factor(scaled: sparse.csr_array, deflated: FloatArray) -> _DenseFactor:
@@ -271,7 +270,7 @@ def _dense_factor(scaled: sparse.csr_array, deflated: FloatArray) -> _DenseFacto
         shift = max(_SHIFT, 10.0 * shift)
 
 
-def _orthonormal(gauge: FloatArray, scale: FloatArray, dead: BoolArray, matrix: sparse.csr_array) -> FloatArray:
+def _orthonormal(gauge: FloatArray, scale: FloatArray, dead: BoolArray, matrix: Symmetric) -> FloatArray:
     """(D, g') orthonormal basis, in scaled units, of those directions of the gauge that S leaves free."""
     if not gauge.shape[1]:
         return gauge

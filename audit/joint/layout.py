@@ -72,6 +72,12 @@ class Layout:
         """Images with columns that belong to a camera."""
         return np.flatnonzero(self.camera_idx == camera_idx)
 
+    def group_of_column(self) -> IntArray:
+        """(D,) number of what each column is of: a frame, or a camera."""
+        starts = np.concatenate([self.columns[self.has_columns, 0], self.own_columns])
+        starts = np.unique(starts[starts < self.num_columns])
+        return np.asarray(np.searchsorted(starts, np.arange(self.num_columns), side="right") - 1)
+
 
 def make_layout(
     model: SparseModel, used: BoolArray, frame_idx: IntArray | None, image_from_frame: FloatArray | None
@@ -86,10 +92,8 @@ def make_layout(
     num_images, num_cameras = len(model.images), len(model.cameras)
     frames = np.arange(num_images) if frame_idx is None else np.asarray(frame_idx, dtype=np.int64)
     camera_idx = np.where(used, model.images.camera_idx, -1)
-    own: list[tuple[int, ...]] = []
-    for camera in range(num_cameras):
-        seen = bool((camera_idx == camera).any())
-        own.append(fitted_param_idxs(model.camera(camera).model) if seen else ())
+    seen = np.bincount(camera_idx[camera_idx >= 0], minlength=num_cameras) > 0
+    own = [fitted_param_idxs(model.camera(k).model) if is_seen else () for k, is_seen in enumerate(seen.tolist())]
     first, dense = np.unique(frames[used], return_index=True, return_inverse=True)[1:]
     frame = np.full(num_images, -1, dtype=np.int64)
     frame[used] = dense

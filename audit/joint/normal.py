@@ -10,13 +10,15 @@ import numpy as np
 from scipy import sparse
 
 from sfm_audit.audit.joint.design import AT_ONCE
-from sfm_audit.audit.joint.layout import Layout
+from sfm_audit.audit.joint.layout import NUM_POSE, Layout
+from sfm_audit.audit.joint.matrix import PairMatrix, Symmetric
 from sfm_audit.audit.joint.neighbourhood import Neighbourhood, neighbourhood, point_chunks, sum_by_track
 from sfm_audit.audit.joint.observations import JointObservations, design_crossed, point_information
 from sfm_audit.audit.joint.sums import has_joint_sums, joint_sums
 from sfm_audit.audit.kernels.joint import JointSums
+from sfm_audit.audit.kernels.joint_matrix import Blocks
 from sfm_audit.audit.kernels.joint_normal import OtherSystem, PairBlocks, meats, normals
-from sfm_audit.audit.kernels.joint_parts import symmetric_of_blocks, two_informations, unit_determinants
+from sfm_audit.audit.kernels.joint_parts import two_informations, unit_determinants
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
@@ -32,7 +34,7 @@ class ReducedSystem:
     """
 
     point_inverse: FloatArray
-    matrix: sparse.csr_array
+    matrix: Symmetric
     right: FloatArray
     before: FloatArray
 
@@ -89,20 +91,16 @@ def _compiled_systems(
     found = _of_images(observations, images, lambda some: normals(sums, some, observations.transform, other))
     if not found:
         return None
-    own_columns, others, columns = _columns_of(layout, images, [each.pairs for each in found])
+    own_columns = layout.columns[images]
     grams, rights = (np.concatenate([each[k] for each in found]) for k in (1, 2))
-
-    def system(k: int) -> ReducedSystem:
+    systems = []
+    for k, inverse in enumerate(inverses):
         right, before = np.zeros((2, layout.num_columns + 1))
         np.add.at(right, own_columns, rights[:, k])
         np.add.at(before, own_columns, np.einsum("iaa->ia", grams[:, k]))
-        slabs = np.concatenate([each.pairs.slabs[k] for each in found])
-        matrix = _symmetric(layout.num_columns, others, columns, slabs)
-        return ReducedSystem(inverses[k], matrix, right[:-1], before[:-1])
-
-    parts = over_ranges(lambda k, end: [system(each) for each in range(k, end)], len(inverses), range_weight=1.0)
-    robust, plain = (one for part in parts for one in part)
-    return robust, plain
+        matrix = _of_pairs(layout, images, [each.pairs for each in found], k)
+        systems.append(ReducedSystem(inverse, matrix, right[:-1], before[:-1]))
+    return systems[0], systems[1]
 
 
 def _of_images(observations: JointObservations, images: IntArray, compiled: Callable[[IntArray], T | None]) -> list[T]:
@@ -113,23 +111,14 @@ def _of_images(observations: JointObservations, images: IntArray, compiled: Call
     return found if len(found) == len(parts) else []
 
 
-def _columns_of(layout: Layout, images: IntArray, pairs: Sequence[PairBlocks]) -> tuple[IntArray, IntArray, IntArray]:
-    """Columns of the images (k, C), and of both images of each pair (m, C), first those of the rows."""
-    own = layout.columns[images]
+def _of_pairs(layout: Layout, images: IntArray, pairs: Sequence[PairBlocks], system: int) -> PairMatrix:
+    """The matrix of the blocks of all images (k,)."""
     counts = np.concatenate([each.counts for each in pairs])
-    return own, layout.columns[np.concatenate([each.around for each in pairs])], np.repeat(own, counts, axis=0)
-
-
-def _symmetric(num_columns: int, rows: IntArray, columns: IntArray, blocks: FloatArray) -> sparse.csr_array:
-    """(D, D) A + A^T of blocks (m, r, c) of A at rows (m, r) and columns (m, c); D is padding."""
-    compiled = symmetric_of_blocks(num_columns, rows, columns, blocks)
-    if compiled is not None:
-        return sparse.csr_array(compiled, shape=(num_columns, num_columns))
-    row = np.broadcast_to(rows.astype(np.int32)[:, :, None], blocks.shape).ravel()
-    column = np.broadcast_to(columns.astype(np.int32)[:, None, :], blocks.shape).ravel()
-    size = num_columns + 1
-    half = sparse.coo_array((blocks.ravel(), (row, column)), shape=(size, size)).tocsr()
-    return sparse.csr_array((half + half.T)[:num_columns, :num_columns])
+    columns = np.repeat(layout.columns[images], counts, axis=0)
+    others = layout.columns[np.concatenate([each.around for each in pairs])]
+    slabs = np.concatenate([each.slabs[system] for each in pairs])
+    marks = (0, NUM_POSE) if layout.width > NUM_POSE else (0,)
+    return PairMatrix(Blocks(layout.num_columns, others, columns, slabs), layout.group_of_column(), marks)
 
 
 def _eliminate_points(
@@ -160,7 +149,7 @@ def _neighbourhoods(observations: JointObservations) -> Iterator[tuple[int, Neig
             yield image, neighbourhood(observations, points[chunk]).from_image(image)
 
 
-def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.csr_array:
+def score_meat(observations: JointObservations, left_px: FloatArray) -> Symmetric:
     """Return M (D, D): sum over tracks of g_t g_t^T, with g_t the score of the base system from track t.
 
     Parameters
@@ -184,13 +173,10 @@ def score_meat(observations: JointObservations, left_px: FloatArray) -> sparse.c
     return blocks.matrix()
 
 
-def _compiled_meat(observations: JointObservations, sums: JointSums) -> sparse.csr_array | None:
+def _compiled_meat(observations: JointObservations, sums: JointSums) -> PairMatrix | None:
     layout, images = observations.layout, np.array(observations.used_images, dtype=np.int64)
     found = _of_images(observations, images, lambda some: meats(sums, some, observations.transform))
-    if not found:
-        return None
-    slabs = np.concatenate([each.slabs[0] for each in found])
-    return _symmetric(layout.num_columns, *_columns_of(layout, images, found)[1:], slabs)
+    return _of_pairs(layout, images, found, 0) if found else None
 
 
 def off_points(

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
@@ -17,6 +16,7 @@ from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_inverse
 from sfm_audit.audit.joint.layout import NUM_POSE
+from sfm_audit.audit.joint.matrix import Symmetric, operator_of
 from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
 from sfm_audit.audit.joint.sums import joint_sums, moved_by
@@ -138,7 +138,7 @@ class JointSystem:
         return out
 
 
-def _sandwiches(main: SymmetricInverse, meat: sparse.csr_array, blocks: Sequence[IntArray]) -> Iterator[FloatArray]:
+def _sandwiches(main: SymmetricInverse, meat: Symmetric, blocks: Sequence[IntArray]) -> Iterator[FloatArray]:
     """The same by rows of the inverse, some at once."""
     for batch in _batches(blocks):
         rows = main.rows(np.concatenate(batch))
@@ -229,5 +229,5 @@ def _plain_step(plain: ReducedSystem, base: Base, gauge: FloatArray) -> FloatArr
     if len(plain.right) <= _DIRECT:
         return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main.apply(plain.right))
     front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=base.inverse.main.apply)
-    step, _ = sparse_linalg.cg(plain.matrix, plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
+    step, _ = sparse_linalg.cg(operator_of(plain.matrix), plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
     return np.asarray(step)

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.checked import SmallIntArray, doubles, ints, small_ints
+from sfm_audit.audit.kernels.checked import doubles, ints, small_ints
 from sfm_audit.audit.kernels.joint import JointIndex
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
@@ -205,25 +205,3 @@ def dense_entries(matrix: FloatArray, columns: IntArray) -> FloatArray | None:
     out = np.empty((columns.size, columns.size))
     status = function(columns.size, np.ascontiguousarray(columns, dtype=np.int64), len(matrix), in_order, out)
     return out if status == _DONE else None
-
-
-def symmetric_of_blocks(
-    size: int, rows: IntArray, columns: IntArray, blocks: FloatArray
-) -> tuple[FloatArray, SmallIntArray, IntArray] | None:
-    """Data, columns and starts of rows of the sparse A + A^T (D, D); None for the numpy path.
-
-    Parameters
-    ----------
-    rows, columns, blocks : (m, r), (m, c) and (m, r, c) of A; D is padding
-    """
-    function = kernel("joint_symmetric", *([Size] * 4), Ints, Ints, Doubles, Size, Ints, SmallInts, Doubles)
-    num, height, width = blocks.shape
-    if function is None or not blocks.size or max(size, num) >= np.iinfo(np.int32).max:
-        return None
-    if rows.shape != (num, height) or columns.shape != (num, width) or min(rows.min(), columns.min()) < 0:
-        raise ValueError("blocks of another matrix")
-    room = 2 * blocks.size
-    starts, indices, data = np.empty(size + 1, dtype=np.int64), np.empty(room, dtype=np.int32), np.empty(room)
-    given = np.ascontiguousarray(rows), np.ascontiguousarray(columns), np.ascontiguousarray(blocks)
-    count = function(size, num, height, width, *given, room, starts, indices, data)
-    return (data[:count], indices[:count], starts) if count >= 0 else None

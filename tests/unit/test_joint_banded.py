@@ -12,10 +12,12 @@ from numpy.testing import assert_allclose
 from scipy import sparse
 
 from sfm_audit.audit.joint import inverse as joint_inverses
-from sfm_audit.audit.joint.banded import BandedInverse, _starts, band_of, banded_factor
+from sfm_audit.audit.joint.band import _starts, band_blocks, band_of
+from sfm_audit.audit.joint.banded import BandedInverse, banded_factor
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
+from sfm_audit.audit.joint.matrix import csr_of
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 from sfm_audit.audit.joint.own import _walds, walds
 
@@ -62,7 +64,7 @@ def own_of(system, image):
 
 def test_a_street_is_a_band_and_a_room_is_none(street, reduced):
     band = band_of(reduced.matrix)
-    row, column = (band.place[each] for each in reduced.matrix.nonzero())
+    row, column = (band.place[each] for each in csr_of(reduced.matrix).nonzero())
     within = (row < band.num_banded) & (column < band.num_banded)
     assert np.abs(row[within] - column[within]).max() == band.width
     assert np.abs(band.number(row[within]) - band.number(column[within])).max() == 1
@@ -124,7 +126,7 @@ def test_a_further_null_direction_is_found_in_a_band_too(street, reduced):
     first, second = own_of(street, 30)
     merge = np.eye(len(reduced.right))
     merge[second] = merge[first]
-    matrix = type(reduced.matrix)(merge @ reduced.matrix.toarray() @ merge.T)
+    matrix = sparse.csr_array(merge @ reduced.matrix.toarray() @ merge.T)
     found = inverted(street, matrix=matrix)
     assert isinstance(found.main, BandedInverse)
     assert found.num_null == 1
@@ -215,7 +217,31 @@ def test_a_border_that_is_not_positive_definite_makes_no_factor(street, reduced)
     matrix = reduced.matrix.toarray()
     matrix[own_of(street, 0), own_of(street, 0)] *= 1e-3
     gauge = np.zeros((len(matrix), 0))
-    assert banded_factor(sparse.csr_array(matrix), band, gauge) is None
+    assert banded_factor(sparse.csr_array(matrix), band, gauge, np.ones(len(matrix))) is None
+
+
+def test_the_blocks_of_a_band_are_the_matrix_in_its_order(reduced, scale):
+    """From blocks of pairs of images and from a sparse matrix; a column of scale zero is zero."""
+    band, unit = band_of(reduced.matrix), 1.0 / scale
+    unit[7] = 0.0
+    expected = (reduced.matrix.toarray() * unit * unit[:, None])[np.ix_(band.order, band.order)]
+    for matrix in (reduced.matrix, csr_of(reduced.matrix)):
+        found = band_blocks(matrix, band, unit)
+        parts = list(band.blocks())
+        for own, block in zip(parts, found.diagonal, strict=True):
+            assert_allclose(block, expected[own, own], atol=1e-14)
+        for (own, following), block in zip(pairwise(parts), found.below, strict=True):
+            assert_allclose(block, expected[following, own], atol=1e-14)
+        assert_allclose(found.border, expected[:, band.num_banded :], atol=1e-14)
+
+
+def test_columns_in_groups_make_a_band_as_columns_alone_do(reduced):
+    found, alone = band_of(reduced.matrix), band_of(csr_of(reduced.matrix))
+    assert found.num_border == alone.num_border
+    assert found.width <= 1.5 * alone.width
+    row, column = (found.place[each] for each in csr_of(reduced.matrix).nonzero())
+    within = (row < found.num_banded) & (column < found.num_banded)
+    assert np.abs(row[within] - column[within]).max() == found.width
 
 
 def test_blocks_end_behind_what_the_one_before_couples_with():

@@ -278,7 +278,7 @@ def test_a_further_null_direction_is_found_and_said(system):
     matrix = reduced.matrix.toarray()
     size, twice = len(matrix), int(system.observations.layout.own_of_camera(0)[0])
     index = np.append(np.arange(size), twice)
-    doubled = type(reduced.matrix)(matrix[np.ix_(index, index)])
+    doubled = sparse.csr_array(matrix[np.ix_(index, index)])
     gauge = np.zeros((size + 1, 7))
     values, vectors = np.linalg.eigh(matrix / np.sqrt(np.outer(matrix.diagonal(), matrix.diagonal())))
     gauge[:size] = vectors[:, :7] / np.sqrt(matrix.diagonal())[:, None]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, with_rig
 from numpy.testing import assert_allclose
-from scipy import sparse
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
@@ -33,7 +32,6 @@ from sfm_audit.audit.kernels.joint_parts import (
     dense_entries,
     near_entries,
     point_information,
-    symmetric_of_blocks,
     unit_determinants,
 )
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS
@@ -364,27 +362,3 @@ def test_entries_of_a_band_and_of_a_matrix():
     np.testing.assert_array_equal(dense_entries(full, place[::-1].copy()), full[np.ix_(place[::-1], place[::-1])])
     assert dense_entries(full, np.array([0, 10])) is None
     assert dense_entries(full[:, ::2], np.array([0])) is None
-
-
-@pytest.mark.parametrize("size", [1, 7, 63, 64, 65, 130])
-def test_blocks_make_the_symmetric_matrix_that_scipy_makes(size):
-    """Places met once, twice and never, the padding, and blocks of which a column comes twice."""
-    rng = np.random.default_rng(size)
-    rows, columns = rng.integers(0, size + 1, (40, 3)), rng.integers(0, size + 1, (40, 5))
-    blocks = rng.normal(size=(40, 3, 5))
-    expected = np.zeros((size + 1, size + 1))
-    np.add.at(expected, (rows[:, :, None], columns[:, None, :]), blocks)
-    expected = (expected + expected.T)[:size, :size]
-    data, indices, starts = symmetric_of_blocks(size, rows, columns, blocks)
-    found = sparse.csr_array((data, indices, starts), shape=(size, size))
-    assert found.has_canonical_format
-    assert_allclose(found.toarray(), expected, atol=1e-13)
-    met = np.zeros((size + 1, size + 1), dtype=bool)
-    met[rows[:, :, None], columns[:, None, :]] = True
-    assert found.nnz == (met | met.T)[:size, :size].sum()
-    with pytest.raises(ValueError, match="another matrix"):
-        symmetric_of_blocks(size, rows - size - 1, columns, blocks)
-    with pytest.raises(ValueError, match="another matrix"):
-        symmetric_of_blocks(size, rows[:, :2], columns, blocks)
-    with numpy_only():
-        assert symmetric_of_blocks(size, rows, columns, blocks) is None

@@ -1,0 +1,77 @@
+"""Symmetric matrices of blocks of pairs of images: as scipy and numpy make them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import sparse
+
+from sfm_audit.audit.joint.matrix import PairMatrix, operator_of
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.joint_matrix import (
+    BandPlaces,
+    Blocks,
+    band_of_blocks,
+    checked_blocks,
+    symmetric_of_blocks,
+    times_blocks,
+)
+
+pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels here: nothing to compare")
+
+
+@pytest.mark.parametrize("size", [1, 7, 63, 64, 65, 130])
+def test_blocks_make_the_symmetric_matrix_that_scipy_makes(size):
+    """Places met once, twice and never, the padding, and blocks of which a column comes twice."""
+    rng = np.random.default_rng(size)
+    rows, columns = rng.integers(0, size + 1, (40, 3)), rng.integers(0, size + 1, (40, 5))
+    blocks = rng.normal(size=(40, 3, 5))
+    expected = np.zeros((size + 1, size + 1))
+    np.add.at(expected, (rows[:, :, None], columns[:, None, :]), blocks)
+    expected = (expected + expected.T)[:size, :size]
+    given = checked_blocks(Blocks(size, rows, columns, blocks))
+    data, indices, starts = symmetric_of_blocks(given)
+    found = sparse.csr_array((data, indices, starts), shape=(size, size))
+    assert found.has_canonical_format
+    assert_allclose(found.toarray(), expected, atol=1e-13)
+    met = np.zeros((size + 1, size + 1), dtype=bool)
+    met[rows[:, :, None], columns[:, None, :]] = True
+    assert found.nnz == (met | met.T)[:size, :size].sum()
+    values = rng.normal(size=(size, 3))
+    assert_allclose(times_blocks(given, values), expected @ values, atol=1e-13)
+    matrix = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
+    assert_allclose(matrix.diagonal(), expected.diagonal(), atol=1e-13)
+    assert_allclose(operator_of(matrix) @ values[:, 0], expected @ values[:, 0], atol=1e-13)
+    with numpy_only():
+        assert symmetric_of_blocks(given) is None
+        assert times_blocks(given, values) is None
+        alone = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
+        assert_allclose(alone.toarray(), expected, atol=1e-13)
+        assert_allclose(alone @ values, expected @ values, atol=1e-13)
+
+
+def test_blocks_of_another_matrix_or_band_never_reach_the_kernel():
+    rng = np.random.default_rng(3)
+    rows = columns = np.array([[0, 1], [2, 3]])
+    given = Blocks(4, rows, columns, rng.normal(size=(2, 2, 2)))
+    for wrong in (given._replace(rows=rows - 5), given._replace(rows=rows[:, :1]), given._replace(columns=rows[:1])):
+        with pytest.raises(ValueError, match="another matrix"):
+            checked_blocks(wrong)
+    with pytest.raises(ValueError, match="expected an array of shape"):
+        times_blocks(given, np.zeros((3, 1)))
+    order = BandPlaces(np.arange(4), np.array([0, 2, 4]))
+    diagonal, below, border = band_of_blocks(given, order, np.ones(4))
+    expected = given.blocks + given.blocks.transpose(0, 2, 1)
+    assert_allclose(diagonal, expected)
+    assert (len(below), border.shape, below[0].any()) == (1, (4, 0), False)
+    for wrong, told in (
+        (BandPlaces(np.arange(4) + 1, order.starts), "places"),
+        (BandPlaces(order.place, rows[1]), "band"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            band_of_blocks(given, wrong, np.ones(4))
+    far = given._replace(columns=np.array([[2, 3], [0, 1]]))
+    assert band_of_blocks(far, BandPlaces(np.arange(4), np.array([0, 1, 2, 3, 4])), np.ones(4)) is None
+    with numpy_only():
+        assert band_of_blocks(given, order, np.ones(4)) is None
