@@ -26,6 +26,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks, scale_only_noise
+from sfm_audit.audit.noise.others import ByRow
 from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
 from sfm_audit.audit.noise.prior import fit_track_prior
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
@@ -143,7 +144,7 @@ class HeldOut:
         train_all = np.flatnonzero(self.verified & self.fitted & steady[self.image_idx])
         prior = fit_track_prior(q[train_all], c[train_all], dof[train_all])
         for train, test in self._halves():
-            standardiser = TrackStandardiser.build(predict(prior, c[train], dof[train]))
+            standardiser = TrackStandardiser.build(predict(prior, ByRow(c[train], dof[train], dof[train]), len(train)))
             factor = standardiser.standardise(statistics.whitened_px[:, train], slice(0, len(train))).factor
             nu, b = prior.nu0 + dof[test], prior.nu0 * prior.s0_px**2 + c[test]
             spread = np.log(2 * np.pi * factor**2 * b / nu) + (0.5 * nu + 1) * np.log1p(q[test] / (factor**2 * b))

@@ -80,7 +80,7 @@ def image_columns(
 ) -> dict[str, Column]:
     """Return the columns of some images; ``ks_q`` needs all images of the model and is left null.
 
-    track_length : (n,) audited observations of the track of each inlier of the model
+    track_length : (n,) audited observations of the track of each inlier of the images
     """
     same = np.zeros(len(known), dtype=np.int64)
     measured, tested, images = known.measured, known.tested, known.images
@@ -136,9 +136,9 @@ def _counts(known: KnownImages, track_length: Int32Array) -> dict[str, Column]:
     """How many observations there are of each kind, and how long their tracks are."""
     residuals, images, num = known.facts.residuals, known.images, known.measured.num_inliers
     lost = residuals.num_behind[images] + residuals.num_nonfinite[images] + residuals.num_dangling[images]
-    first, last = residuals.offsets[known.image_idxs.start], residuals.offsets[known.image_idxs.stop]
-    total = np.concatenate([[0], np.cumsum(track_length[first:last], dtype=np.int64)])
-    ends = residuals.offsets[known.image_idxs.start : known.image_idxs.stop + 1] - first
+    total = np.concatenate([[0], np.cumsum(track_length, dtype=np.int64)])
+    ends = residuals.offsets[known.image_idxs.start : known.image_idxs.stop + 1]
+    ends = ends - ends[0]
     with np.errstate(invalid="ignore"):
         mean_length = np.diff(total[ends]) / num
     return {

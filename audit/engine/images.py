@@ -47,7 +47,8 @@ def audit_images(auditor: Auditing, image_idxs: range, labels: ModelLabels) -> l
     qualities = auditor.quality[image_idxs.start : image_idxs.stop]
     advice = images_advice(qualities, decisions, partial(_retest, auditor, image_idxs), alpha=config.alpha)
     known = KnownImages(auditor, image_idxs, errors, tested, measured, decisions, advice)
-    columns = image_columns(known, labels, config.noise, tracks.statistics.track_length)
+    first, last = auditor.residuals.offsets[[image_idxs.start, image_idxs.stop]].tolist()
+    columns = image_columns(known, labels, config.noise, tracks.statistics.others.lengths(slice(first, last)))
     return [ImagesPart.of(columns, known, config.column_groups)]
 
 

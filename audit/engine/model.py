@@ -254,7 +254,7 @@ class ModelAuditor:
             float(self.residuals.pose_offset_px[image_idx]),
             constant,
             self.noise(image_idx, constant),
-            track_length=self.tracks.statistics.track_length[rows],
+            track_length=self.tracks.statistics.others.lengths(rows),
             quality=self.quality[image_idx],
             misfit=self.misfit(image_idx),
             retest=partial(self.retest, image_idx),

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import special
 
 from sfm_audit.audit.noise.fits import CONSISTENCY, CUTOFF
+from sfm_audit.audit.noise.others import EVERY, Others
 from sfm_audit.audit.noise.prior import TrackPrior
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
@@ -32,13 +33,12 @@ class Prediction:
     """What the tracks predict for observations: scale (n,) px of (4), degrees of freedom by table row.
 
     prior: of the tracks.    dof_values: (v,) the distinct nu_k, ascending.
-    all_other_sq_px2, all_other_dof: (m,) c and nu_k.    used: (m,) of which observations; all when None.
+    others: of m observations, c and nu_k.    used: (m,) of which of them; all when None.
     """
 
     prior: TrackPrior
     dof_values: IntArray
-    all_other_sq_px2: FloatArray
-    all_other_dof: Int32Array | IntArray
+    others: Others
     used: BoolArray | None = None
 
     @property
@@ -51,28 +51,33 @@ class Prediction:
         """(n,) row of nu_values for each observation."""
         row_of = np.zeros(int(self.dof_values[-1]) + 1 if self.dof_values.size else 1, dtype=np.int32)
         row_of[self.dof_values] = np.arange(self.dof_values.size)
-        return row_of[self.all_other_dof if self.used is None else self.all_other_dof[self.used]]
+        other_dof = self.others.dof(EVERY)
+        return row_of[other_dof if self.used is None else other_dof[self.used]]
 
     @cached_property
     def scale_px(self) -> FloatArray:
         """(n,) scale of (4), px."""
-        other_sq_px2 = self.all_other_sq_px2 if self.used is None else self.all_other_sq_px2[self.used]
+        other_sq_px2 = self.others.of(EVERY)[0]
+        if self.used is not None:
+            other_sq_px2 = other_sq_px2[self.used]
         scale_sq = (self.prior.nu0 * self.prior.s0_px**2 + other_sq_px2) / self.nu_values[self.nu_row]
         return np.asarray(np.sqrt(scale_sq), dtype=np.float64)
 
 
-def predict(
-    prior: TrackPrior,
-    other_sq_px2: FloatArray,
-    other_dof: Int32Array | IntArray,
-    used: BoolArray | None = None,
-) -> Prediction:
-    """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4); used: (n,) of which, all when None."""
-    is_there = np.zeros(max(int(other_dof.max(initial=0)), 0) + 1, dtype=np.bool_)  # small: no need to sort two million
-    for start in range(0, other_dof.size, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        is_there[other_dof[part] if used is None else other_dof[part].compress(used[part])] = True
-    return Prediction(prior, np.flatnonzero(is_there), other_sq_px2, other_dof, used)
+def predict(prior: TrackPrior, others: Others, num: int, used: BoolArray | None = None) -> Prediction:
+    """Return scale^2 = (nu0 s0^2 + nu_k a_k^2) / nu and nu = nu0 + nu_k of (4) for num observations.
+
+    Parameters
+    ----------
+    used : (num,) of which; all when None
+    """
+    is_there = np.zeros(1, dtype=np.bool_)  # small: no need to sort two million
+    for start in range(0, num, _CHUNK):
+        part = slice(start, min(start + _CHUNK, num))
+        dof = others.dof(part)
+        is_there = np.pad(is_there, (0, max(int(dof.max()) + 1 - is_there.size, 0)))
+        is_there[dof if used is None else dof.compress(used[part])] = True
+    return Prediction(prior, np.flatnonzero(is_there), others, used)
 
 
 class StudentToNormal:

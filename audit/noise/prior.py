@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from sfm_audit.audit.kernels.tracks import PriorGroups
+from sfm_audit.audit.noise.others import ByRow
 from sfm_audit.audit.noise.tracks import TrackStatistics
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
@@ -70,17 +71,15 @@ def fit_track_prior(sq_px2: FloatArray, other_sq_px2: FloatArray, other_dof: Int
 def fit_prior_of_tracks(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
     """`fit_track_prior` of the observations that are used (n,), all verified, with few arrays of their size."""
     num_used = int(np.count_nonzero(used))
-    total_sq_px2 = float(np.add.reduce(tracks.other_sq_px2, where=used))
-    if num_used < MIN_OBSERVATIONS or not total_sq_px2 < _IN_RANGE[1]:
+    if num_used < MIN_OBSERVATIONS:
         return _fit_few(tracks, used)
-    groups = PriorGroups.of(tracks.whitened_px, tracks.other_sq_px2, tracks.other_dof, used)
-    pieces = _Pieces(tracks, used)
-    own_sq_px2 = pieces.sum_of_squares() if groups is None else float(groups.sq_px2.sum())
-    if not 0.0 < own_sq_px2 < _IN_RANGE[1]:
+    groups, pieces = PriorGroups.of(tracks.whitened_px, tracks.others, used), _Pieces(tracks, used)
+    own_sq_px2, total_sq_px2 = pieces.sums_of_squares() if groups is None else groups.sums_of_squares()
+    if not (0.0 < own_sq_px2 < _IN_RANGE[1] and total_sq_px2 < _IN_RANGE[1]):
         return _fit_few(tracks, used)
     rows = _every(used, max(1, num_used // _MANY))
     sq_px2 = (tracks.whitened_px[:, rows] ** 2).sum(axis=0)
-    dof, other_sq_px2 = tracks.other_dof[rows], tracks.other_sq_px2[rows]
+    other_sq_px2, dof = tracks.others.of(rows)
     sums = pieces.sums if groups is None else partial(_sums_by_group, groups)
     return _fit((sq_px2, other_sq_px2, dof), num_used, lambda: sums)
 
@@ -88,7 +87,8 @@ def fit_prior_of_tracks(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
 def _fit_few(tracks: TrackStatistics, used: BoolArray) -> TrackPrior:
     """`fit_track_prior` of few observations, or of some that are out of range."""
     sq_px2 = (tracks.whitened_px.compress(used, axis=1) ** 2).sum(axis=0)
-    return fit_track_prior(sq_px2, tracks.other_sq_px2[used], tracks.other_dof[used])
+    other_sq_px2, other_dof = tracks.others.of(np.flatnonzero(used))
+    return fit_track_prior(sq_px2, other_sq_px2, other_dof)
 
 
 def _every(used: BoolArray, stride: int) -> IntArray:
@@ -110,18 +110,19 @@ class _Pieces:
 
     def __iter__(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
         """Yield q, c and degrees of freedom."""
-        tracks = self.tracks
         for start in range(0, self.used.size, _CHUNK):
             part = slice(start, start + _CHUNK)
             used = self.used[part]
-            x, y = tracks.whitened_px[:, part].compress(used, axis=1)
+            x, y = self.tracks.whitened_px[:, part].compress(used, axis=1)
             sq = x * x
             sq += y * y
-            yield sq, tracks.other_sq_px2[part].compress(used), tracks.other_dof[part].compress(used).astype(np.float64)
+            other_sq, dof = self.tracks.others.of(part)
+            yield sq, other_sq.compress(used), dof.compress(used).astype(np.float64)
 
-    def sum_of_squares(self) -> float:
-        """Sum of q."""
-        return sum(float(sq.sum()) for sq, _, _ in self)
+    def sums_of_squares(self) -> tuple[float, float]:
+        """Sums of q and of c."""
+        own, other = zip(*((float(sq.sum()), float(other_sq.sum())) for sq, other_sq, _ in self), strict=True)
+        return sum(own), sum(other)
 
     def sums(self, nu0: float, prior_sq: float) -> FloatArray:
         """`_sums` of all pieces."""
@@ -242,7 +243,8 @@ def _log_likelihood(x: FloatArray, sums: _Sums) -> _Likelihood:
 def _sums_of(sq: FloatArray, other_sq: FloatArray, other_dof: Int32Array | IntArray) -> _Sums:
     """The sums over these observations, finite, by their number of degrees of freedom where kernels are compiled."""
     dof = other_dof.astype(np.float64)
-    groups = PriorGroups.of(sq, other_sq, other_dof) if float(sq.sum() + other_sq.sum()) < _IN_RANGE[1] else None
+    is_in_range = float(sq.sum() + other_sq.sum()) < _IN_RANGE[1]
+    groups = PriorGroups.of(sq, ByRow(other_sq, other_dof, other_dof)) if is_in_range else None
 
     def sums(nu0: float, prior_sq: float) -> FloatArray:
         if groups is not None and _IN_RANGE[0] < prior_sq < _IN_RANGE[1]:

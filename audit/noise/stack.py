@@ -112,13 +112,14 @@ def _compiled_track_noises(
     part = slice(image_idxs[0], image_idxs[-1] + 2)
     statistics, prior = tracks.statistics, tracks.prior
     verified_offsets = tracks.verified_offsets[part]
-    found = kernel.Tracks(
-        *(statistics.whitened_px, statistics.verified, statistics.other_sq_px2, statistics.other_dof),
-        *(prior.nu0, prior.s0_px, standardiser.prediction.dof_values, standardiser.tables),
-    ).noises(tracks.offsets[part], verified_offsets, CONSISTENCY)
-    starts = (verified_offsets - verified_offsets[0]).tolist()
     columns = slice(int(tracks.offsets[part][0]), int(tracks.offsets[part][-1]))
-    _transform_outside(found, standardiser, statistics.other_dof[columns][statistics.verified[columns]])
+    verified, others = statistics.verified[columns], statistics.others.of(columns)
+    found = kernel.Tracks(
+        *(np.ascontiguousarray(statistics.whitened_px[:, columns]), verified, *others),
+        *(prior.nu0, prior.s0_px, standardiser.prediction.dof_values, standardiser.tables),
+    ).noises(tracks.offsets[part] - columns.start, verified_offsets, CONSISTENCY)
+    starts = (verified_offsets - verified_offsets[0]).tolist()
+    _transform_outside(found, standardiser, others[1][verified])
     out: dict[int, ImageNoise] = {}
     with np.errstate(invalid="ignore"):
         detector, structure = np.sqrt(found.detector_px2).tolist(), np.sqrt(found.structure).tolist()
@@ -198,7 +199,8 @@ def _noises_of_stack(
     """
     statistics, (rows, columns) = tracks.statistics, where
     whitened = np.ascontiguousarray(statistics.whitened_px[:, columns].transpose(1, 0, 2))
-    predictor = statistics.other_sq_px2[columns] / statistics.other_dof[columns]  # a_k^2 of (3)
+    other_sq_px2, other_dof = statistics.others.of(columns)
+    predictor = other_sq_px2 / other_dof  # a_k^2 of (3)
     predictor = np.minimum(predictor, _quantiles(predictor, PREDICTOR_QUANTILE)[:, None])
     z, log_factor, solved = _standardised(standardiser, whitened, rows)
     papers = _fits(whitened**2, predictor)

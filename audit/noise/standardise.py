@@ -95,7 +95,7 @@ def model_tracks(
     prior = fit_prior_of_tracks(statistics, used)
     standardiser = None
     if math.isfinite(prior.nu0):
-        prediction = predict(prior, statistics.other_sq_px2, statistics.other_dof, statistics.verified)
+        prediction = predict(prior, statistics.others, statistics.verified.size, statistics.verified)
         standardiser = TrackStandardiser.build(prediction)
     verified = [
         np.count_nonzero(statistics.verified[first:last]) for first, last in pairwise(residuals.offsets.tolist())
@@ -140,8 +140,9 @@ def _verified_px(statistics: TrackStatistics, rows: slice) -> FloatArray:
 
 def _paper_fit(statistics: TrackStatistics, rows: slice, whitened_px: FloatArray) -> VarianceFit:
     verified = statistics.verified[rows]
-    predictor = statistics.other_sq_px2[rows].compress(verified)
-    predictor /= statistics.other_dof[rows].compress(verified)  # a_k^2 of (3)
+    other_sq_px2, other_dof = statistics.others.of(rows)
+    predictor = other_sq_px2.compress(verified)
+    predictor /= other_dof.compress(verified)  # a_k^2 of (3)
     limit = _quantile(predictor, PREDICTOR_QUANTILE)
     return fit_variance(whitened_px * whitened_px, np.minimum(predictor, limit, out=predictor))
 

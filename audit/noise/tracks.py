@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_audit.audit.kernels import tracks as compiled
+from sfm_audit.audit.noise.others import EVERY, ByRow, ByTrack, Others, TrackTable
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 _SUFFICIENT_DETERMINANT = 1e-6  # of the information matrix with unit diagonal: closed-form inverse, else eigenvectors
@@ -25,19 +26,30 @@ class TrackStatistics:
     whitened_px: (2, n) e of (2), covariance sigma^2 I under a correct model; NaN where not verified.
     verified: (n,) L >= min_track_length, the smaller eigenvalue of I - H >= min_eigenvalue, J finite (it is not at the
     poles of a panorama and on the rim of a division model; such an observation does not move its point either).
-    track_length: (n,) L, audited observations of the track.
-    other_sq_px2: (n,) nu_k a_k^2 of (3): the track's sum of squares without observation k, floored at 0, px^2.
-    other_dof: (n,) nu_k = 2 L - 2 - rank.
+    others: what the other observations of the tracks say.
     removable_sq_px2, total_sq_px2: what moving the points alone would remove of the sum of squared residuals.
     """
 
     whitened_px: FloatArray
     verified: BoolArray
-    track_length: Int32Array
-    other_sq_px2: FloatArray
-    other_dof: Int32Array
+    others: Others
     removable_sq_px2: float
     total_sq_px2: float
+
+    @property
+    def track_length(self) -> Int32Array:
+        """(n,) L, audited observations of the track."""
+        return self.others.lengths(EVERY)
+
+    @property
+    def other_sq_px2(self) -> FloatArray:
+        """(n,) nu_k a_k^2 of (3): the track's sum of squares without observation k, floored at 0, px^2."""
+        return self.others.of(EVERY)[0]
+
+    @property
+    def other_dof(self) -> Int32Array:
+        """(n,) nu_k = 2 L - 2 - rank."""
+        return self.others.dof(EVERY)
 
 
 def track_statistics(
@@ -95,8 +107,9 @@ def _compiled(
     point_idx = np.ascontiguousarray(observations[2])
     n = point_idx.size
     used = [np.ones(n, dtype=np.bool_)] + ([] if left_out is None else [~left_out])
-    out = compiled.Whitened.of_size(n)
+    out = np.empty((2, n)), np.empty(n, dtype=np.bool_)
     removable = total = 0.0
+    tables: list[TrackTable] = []
     for rows in used:  # the second writes over what the first said of them
         points = compiled.sums(residuals_px, point_jacobian, point_idx, rows, num_points)
         singular = points.invert(_SUFFICIENT_DETERMINANT)
@@ -104,18 +117,19 @@ def _compiled(
             inverse, rank = _inverses(points.columns[singular, :6].T)
             points.columns[singular, 6:9] = symmetric_times(inverse, points.columns[singular, 6:9].T).T
             points.columns[singular, :6], points.rank[singular] = inverse.T, rank
-        removable, total = points.whiten((residuals_px, point_jacobian, point_idx), rows, limits, out)
-    return TrackStatistics(
-        out.whitened_px, out.verified, out.track_length, out.other_sq_px2, out.other_dof, removable, total
-    )
+        track_sq, removable, total = points.whiten((residuals_px, point_jacobian, point_idx), rows, limits, out)
+        length = points.num_observations
+        tables.insert(0, TrackTable(track_sq, 2 * length - 2 - points.rank, length))
+    return TrackStatistics(*out, ByTrack(point_idx, *out, tuple(tables), left_out), removable, total)
 
 
 def _replace_rows(full: TrackStatistics, rows: BoolArray, part: TrackStatistics) -> TrackStatistics:
     """Return the statistics of ``part`` in ``rows``, of ``full`` elsewhere; the model's sums of squares of ``part``."""
-    full.whitened_px[:, rows] = part.whitened_px
-    full.verified[rows], full.track_length[rows] = part.verified, part.track_length
-    full.other_sq_px2[rows], full.other_dof[rows] = part.other_sq_px2, part.other_dof
-    return replace(full, removable_sq_px2=part.removable_sq_px2, total_sq_px2=part.total_sq_px2)
+    full.whitened_px[:, rows], full.verified[rows] = part.whitened_px, part.verified
+    others = ByRow(full.other_sq_px2, full.other_dof, full.track_length)
+    others.sq_px2[rows], others.all_dof[rows] = part.other_sq_px2, part.other_dof
+    others.track_length[rows] = part.track_length
+    return replace(full, others=others, removable_sq_px2=part.removable_sq_px2, total_sq_px2=part.total_sq_px2)
 
 
 def _statistics(
@@ -146,9 +160,7 @@ def _statistics(
     return TrackStatistics(
         whitened,
         verified,
-        length.take(point_idx),
-        other_sq,
-        (2 * length - 2 - rank).take(point_idx),
+        ByRow(other_sq, (2 * length - 2 - rank).take(point_idx), length.take(point_idx)),
         removable,
         sum(float(np.vdot(residuals_px[:, part], residuals_px[:, part])) for part in _chunks(len(square))),
     )

@@ -15,6 +15,7 @@ from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels import noise as kernel
 from sfm_audit.audit.noise import stack
 from sfm_audit.audit.noise.fits import CONSISTENCY, fit_constant_variance
+from sfm_audit.audit.noise.others import ByRow
 from sfm_audit.audit.noise.predictive import TrackStandardiser, predict
 from sfm_audit.audit.noise.prior import TrackPrior
 from sfm_audit.audit.noise.standardise import ModelTracks, constant_noise, track_noise
@@ -32,16 +33,14 @@ def tracks_of(rng, sizes, prior, *, spread=1.0, hidden=0.1):
     verified = rng.random(n) >= hidden
     whitened = np.where(verified, spread * np.sqrt(variance) * rng.standard_normal((2, n)), np.nan)
     other = np.where(verified, variance * rng.chisquare(dof), np.nan)
-    statistics = TrackStatistics(whitened, verified, dof, other, dof, 0.0, 1.0)
+    statistics = TrackStatistics(whitened, verified, ByRow(other, dof, dof), 0.0, 1.0)
     return model_of_tracks(statistics, sizes, prior)
 
 
 def model_of_tracks(statistics, sizes, prior):
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     verified = statistics.verified
-    standardiser = TrackStandardiser.build(
-        predict(prior, statistics.other_sq_px2[verified], statistics.other_dof[verified])
-    )
+    standardiser = TrackStandardiser.build(predict(prior, statistics.others, verified.size, verified))
     before = np.concatenate([[0], np.cumsum(verified)])
     nobody = np.zeros(len(sizes), dtype=np.bool_)
     return ModelTracks(statistics, nobody, False, offsets, before[offsets], prior, standardiser)
@@ -81,7 +80,8 @@ def test_every_way_to_fit_the_papers_variances(kind):
     e = np.sqrt(variance) * rng.standard_normal((2, 4800))
     if kind == "outliers":
         e[:, rng.random(4800) < 0.2] *= 500.0
-    statistics = dataclasses.replace(tracks.statistics, whitened_px=e, other_sq_px2=a_sq * tracks.statistics.other_dof)
+    others = dataclasses.replace(tracks.statistics.others, sq_px2=a_sq * tracks.statistics.other_dof)
+    statistics = dataclasses.replace(tracks.statistics, whitened_px=e, others=others)
     found = assert_same(model_of_tracks(statistics, sizes, prior), 12)
     zero = {(noise.sigma_d_px == 0.0, noise.sigma_l == 0.0) for noise in found.values()}
     expected = {"structure": (False, False), "proportional": (True, False), "one_length": (False, True)}
@@ -102,7 +102,8 @@ def test_odd_numbers_are_left_to_numpy():
     e, other = tracks.statistics.whitened_px.copy(), tracks.statistics.other_sq_px2.copy()
     e[0, 10], e[:, 50:100], e[1, 120], other[170] = math.nan, 0.0, math.inf, math.inf
     e[:, 200:245], e[:, 250:300], other[320] = 0.0, 1e200 * e[:, 250:300], math.nan
-    statistics = dataclasses.replace(tracks.statistics, whitened_px=e, other_sq_px2=other)
+    others = dataclasses.replace(tracks.statistics.others, sq_px2=other)
+    statistics = dataclasses.replace(tracks.statistics, whitened_px=e, others=others)
     found = stack.track_noises(
         dataclasses.replace(tracks, statistics=statistics), range(8), dict.fromkeys(range(8), 0.5)
     )

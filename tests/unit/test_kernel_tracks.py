@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,11 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.tracks import PriorGroups, sums
+from sfm_audit.audit.kernels.tracks import PriorGroups, sums, track_others
+from sfm_audit.audit.noise.others import ByRow
 from sfm_audit.audit.noise.prior import _sums, _sums_of, fit_track_prior
 from sfm_audit.audit.noise.tracks import track_statistics
 
 pytestmark = pytest.mark.skipif(not kernels_in_use(), reason="no compiled kernels")
+NAMES = ("whitened_px", "verified", "track_length", "other_sq_px2", "other_dof", "removable_sq_px2", "total_sq_px2")
 
 
 def random_tracks(rng, lengths, scale=1.0):
@@ -30,8 +31,8 @@ def both(residuals, jacobian, point_idx, num_points, **options):
 
 
 def assert_same(found, expected):
-    for field in dataclasses.fields(expected):
-        name, value = field.name, getattr(expected, field.name)
+    for name in NAMES:
+        value = getattr(expected, name)
         scale = np.nanmax(np.abs(np.where(np.isfinite(value), value, 0.0)), initial=0.0)
         assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-12 * scale, err_msg=name)
         assert getattr(found, name).dtype == value.dtype if isinstance(value, np.ndarray) else True
@@ -88,13 +89,57 @@ def test_a_point_that_is_not_there_is_no_memory(row):
         sums(residuals[:, 1:], jacobian, point_idx, np.ones(9, dtype=np.bool_), 3)
 
 
+@pytest.mark.parametrize("leave_out", [False, True])
+def test_others_of_some_rows(leave_out):
+    rng = np.random.default_rng(9)
+    jacobian, residuals, point_idx = random_tracks(rng, rng.integers(1, 9, 60))
+    left_out = point_idx % 5 == 1 if leave_out else None
+    found, expected = both(residuals, jacobian, point_idx, 60, left_out=left_out)
+    rows = rng.integers(0, point_idx.size, 40)
+    for asked in (slice(7, 90), slice(90, 91), slice(5, 5), slice(250, None), rows, rows.reshape(8, 5)):
+        of_found, of_expected = found.others.of(asked), expected.others.of(asked)
+        for some, others in zip(of_found, of_expected, strict=True):
+            assert_allclose(some, others, rtol=1e-9, atol=1e-12)
+        with numpy_only():
+            assert all(map(np.array_equal, found.others.of(asked), of_found, (True, False)))
+    assert found.others.lengths(slice(7, 90)).tolist() == expected.track_length[7:90].tolist()
+    assert not leave_out or (found.other_dof[left_out] > expected.other_dof.min()).any()
+
+
+def test_others_of_a_track_that_is_not_there_are_no_memory():
+    sq, dof, point_idx = np.ones(2), np.ones(2, dtype=np.int32), np.array([0, 1, 2])
+    rows = point_idx, np.ones((2, 3)), np.ones(3, dtype=np.bool_)
+    assert track_others((sq, dof), rows, range(2)) is not None
+    for tracks in ((sq, dof), (np.ones(3), dof), (np.ones(3), np.ones(4, dtype=np.int32))):
+        with pytest.raises(IndexError, match="beyond the"):
+            track_others(tracks, rows, range(3))
+    with pytest.raises(ValueError, match="one size"):
+        track_others((np.ones(3), np.ones(3, dtype=np.int32)), (point_idx, np.ones((2, 4)), rows[2]), range(3))
+
+
+def test_groups_of_arrays_of_other_sizes_are_no_memory():
+    sq, dof = np.ones(70_000), np.ones(70_000, dtype=np.int32)
+    groups = PriorGroups.of(sq, ByRow(sq, dof, dof))
+    assert groups.counts.tolist() == [70_000]
+    assert groups.sums_of_squares() == (70_000.0, 70_000.0)
+    for size in (1, 69_999):
+        with pytest.raises(ValueError, match="one size"):
+            PriorGroups.of(sq, ByRow(sq[:size], dof, dof))
+    with pytest.raises(ValueError, match="one size"):
+        PriorGroups.of(sq, ByRow(sq, dof, dof), np.ones(7, dtype=np.bool_))
+    with pytest.raises(ValueError, match="one size"):
+        PriorGroups.of(sq, ByRow(sq, dof[1:], dof))
+    with pytest.raises(ValueError, match="negative"):
+        PriorGroups.of(sq, ByRow(sq, -dof, dof))
+
+
 @pytest.mark.parametrize("num", [1, 3, 4, 5, 1023, 1024, 9001])
 @pytest.mark.parametrize("scale", [1e-100, 1.0, 1e100])
 def test_sums_of_the_likelihood(num, scale):
     rng = np.random.default_rng(num)
     sq, other, dof = scale * rng.chisquare(2, num), scale * rng.chisquare(5, num), rng.choice([1, 3, 4, 19], num)
     sq[rng.random(num) < 0.1] = 0.0
-    assert PriorGroups.of(sq, other, dof) is not None
+    assert PriorGroups.of(sq, ByRow(other, dof, dof)) is not None
     for nu0, prior_sq in ((0.1, 1e-3 * scale), (3.0, scale), (1e4, 1e5 * scale)):
         expected = _sums(nu0, prior_sq, sq, other, dof.astype(np.float64))
         rounding = 1e-15 * num * (1.0 + abs(math.log(prior_sq)))  # of numpy, which subtracts two large logarithms

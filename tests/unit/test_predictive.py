@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy import optimize, stats
 
 from sfm_audit.audit.noise.fits import fit_constant_variance
+from sfm_audit.audit.noise.others import ByRow
 from sfm_audit.audit.noise.predictive import (
     StudentToNormal,
     TrackStandardiser,
@@ -154,7 +155,7 @@ def test_too_few_or_zero_observations_have_no_prior():
 def test_standardised_residuals_are_normal_and_the_factor_is_found(nu0, factor):
     e, other, dof = simulate(np.random.default_rng(9), 40_000, nu0, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
-    standardiser = TrackStandardiser.build(predict(prior, other, dof))
+    standardiser = TrackStandardiser.build(predict(prior, ByRow(other, dof, dof), dof.size))
     image = standardiser.standardise(factor * e[:, :20_000], slice(0, 20_000))
     assert image.converged
     assert image.factor == pytest.approx(factor, rel=0.02)
@@ -169,7 +170,9 @@ def test_standardised_residuals_are_normal_and_the_factor_is_found(nu0, factor):
 def test_all_zero_residuals_have_no_factor():
     e, other, dof = simulate(np.random.default_rng(10), 100, 3.0, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
-    image = TrackStandardiser.build(predict(prior, other, dof)).standardise(np.zeros((2, 30)), slice(0, 30))
+    image = TrackStandardiser.build(predict(prior, ByRow(other, dof, dof), dof.size)).standardise(
+        np.zeros((2, 30)), slice(0, 30)
+    )
     assert math.isnan(image.factor)
     assert not image.converged
     assert image.z.shape == (30, 2)
@@ -179,7 +182,7 @@ def test_all_zero_residuals_have_no_factor():
 def test_residuals_far_from_the_prediction_find_their_factor(factor):
     e, other, dof = simulate(np.random.default_rng(11), 400, 8.0, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
-    standardiser = TrackStandardiser.build(predict(prior, other, dof))
+    standardiser = TrackStandardiser.build(predict(prior, ByRow(other, dof, dof), dof.size))
     usual, far = (standardiser.standardise(scale * e, slice(0, 400)) for scale in (1.0, factor))
     assert far.converged
     assert_allclose(far.factor, factor * usual.factor, rtol=1e-6)
@@ -190,6 +193,6 @@ def test_residuals_that_are_all_clipped_have_no_slope_and_cost_no_warning():
     e, other, dof = simulate(np.random.default_rng(12), 60, 8.0, 0.5)
     prior = fit_track_prior((e**2).sum(axis=0), other, dof)
     moved = np.stack([np.full(60, 300.0), np.full(60, 900.0)]) + e
-    image = TrackStandardiser.build(predict(prior, other, dof)).standardise(moved, slice(0, 60))
+    image = TrackStandardiser.build(predict(prior, ByRow(other, dof, dof), dof.size)).standardise(moved, slice(0, 60))
     assert image.factor > 100.0
     assert np.isfinite(image.z).all()

@@ -121,24 +121,21 @@ KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *ja
     return DONE;
 }
 
-/* What is left of a track without the observation, for the used rows: sum of squares, degrees of freedom, length. */
-KERNEL int64_t track_others(int64_t n, const int64_t *point_idx, const uint8_t *used, const double *points,
-                            const uint8_t *rank, const double *track_sq, const double *whitened,
-                            const uint8_t *verified, double *other_sq, int32_t *other_dof, int32_t *length)
+/* What is left of a track without the observation, for rows from start on: sum of squares, degrees of freedom (num,). */
+KERNEL int64_t track_others(int64_t n, int64_t start, int64_t num, const int64_t *point_idx, const double *track_sq,
+                            const int32_t *track_dof, const double *whitened, const uint8_t *verified,
+                            double *other_sq, int32_t *other_dof)
 {
-    for (int64_t k = 0; k < n; k++) {
-        if (k + AHEAD < n) {
-            SOON(track_sq + point_idx[k + AHEAD]);
-            SOON(points + point_idx[k + AHEAD] * POINT + LENGTH);
-            SOON(rank + point_idx[k + AHEAD]);
+    const int64_t *point = point_idx + start;
+    const double *e = whitened + start;
+    for (int64_t k = 0; k < num; k++) {
+        if (k + AHEAD < num) {
+            SOON(track_sq + point[k + AHEAD]);
+            SOON(track_dof + point[k + AHEAD]);
         }
-        if (!used[k])
-            continue;
-        const int64_t i = point_idx[k];
-        const double x = whitened[k], y = whitened[n + k], other = track_sq[i] - (x * x + y * y);
-        length[k] = (int32_t)points[i * POINT + LENGTH];
-        other_dof[k] = 2 * length[k] - 2 - rank[i];
-        other_sq[k] = !verified[k] ? NAN : other < 0.0 ? 0.0 : other;
+        const double other = track_sq[point[k]] - (e[k] * e[k] + e[n + k] * e[n + k]);
+        other_dof[k] = track_dof[point[k]];
+        other_sq[k] = !verified[start + k] ? NAN : other < 0.0 ? 0.0 : other;
     }
     return DONE;
 }
@@ -156,16 +153,18 @@ KERNEL int64_t prior_counts(int64_t n, const uint8_t *used, const int32_t *dof, 
     return DONE;
 }
 
-/* Put |e|^2 and the others' sum of squares of the used observations where those of equal degrees of freedom stand
- * together; next: where the next of each goes. e (2, n), or |e|^2 (n,). */
-KERNEL int64_t prior_groups(int64_t n, const uint8_t *used, const double *e, int64_t is_squared, const double *other_sq,
-                            const int32_t *dof, int64_t *next, double *sq_out, double *other_out)
+/* Put |e|^2 and the others' sum of squares of the used rows from start on where those of equal degrees of freedom
+ * stand together; next: where the next of each goes. used, e (2, n), or |e|^2 (n,): of all; other_sq, dof: (num,). */
+KERNEL int64_t prior_groups(int64_t n, int64_t start, int64_t num, const uint8_t *used, const double *e,
+                            int64_t is_squared, const double *other_sq, const int32_t *dof, int64_t *next,
+                            double *sq_out, double *other_out)
 {
-    for (int64_t k = 0; k < n; k++) {
-        if (!used[k])
+    for (int64_t k = 0; k < num; k++) {
+        const int64_t row = start + k;
+        if (!used[row])
             continue;
         const int64_t at = next[dof[k]]++;
-        sq_out[at] = is_squared ? e[k] : e[k] * e[k] + e[n + k] * e[n + k];
+        sq_out[at] = is_squared ? e[row] : e[row] * e[row] + e[n + row] * e[n + row];
         other_out[at] = other_sq[k];
     }
     return DONE;
