@@ -91,8 +91,7 @@ typedef struct {
 
 /* What add_gram needs of each of some observations. */
 typedef struct {
-    double moment[OBSERVATIONS][MOMENTS], p[OBSERVATIONS][4];
-    double by_p[OBSERVATIONS][2][DENSE], by_w[OBSERVATIONS][2][DENSE];
+    double moment[OBSERVATIONS][MOMENTS], by_p[OBSERVATIONS][2][DENSE], by_w[OBSERVATIONS][2][DENSE], p[OBSERVATIONS][4];
 } gram_parts;
 
 /* Add some observations, at most OBSERVATIONS: parts->p has P_xx, P_xy, P_yy and w of each. */
@@ -206,13 +205,14 @@ static inline void rows_of_image(const joint_model *m, int64_t image, row_block 
 }
 
 /* What the own observations are by themselves: V^-1 J^T, Gram sums, scores. */
-INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, gram_parts *parts, own_gram *sums) {
+INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, own_gram *sums) {
+    gram_parts parts ALIGNED = {0};
     for (int64_t from = 0; from < n; from += OBSERVATIONS) {
         int64_t count = n - from < OBSERVATIONS ? n - from : OBSERVATIONS;
         for (int64_t i = from; i < from + count; i++) {
             int64_t row = o->first + i;
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
-            double w = m->weight[row], *a = o->absorbing + 6 * i, *p = parts->p[i - from];
+            double w = m->weight[row], *a = o->absorbing + 6 * i, *p = parts.p[i - from];
             if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD]);
             absorb(m, row, a);
             p[0] = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
@@ -223,7 +223,7 @@ INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, gram_p
             if (o->track[i] >= 0) memset(score, 0, FIELDS * sizeof *score);
             add_along(score, o->scalar + SCALAR * i, o->dense + 2 * DENSE * i, w * m->left[2 * row], w * m->left[2 * row + 1]);
         }
-        add_gram(sums, parts, count, o->scalar + SCALAR * from, o->dense + 2 * DENSE * from);
+        add_gram(sums, &parts, count, o->scalar + SCALAR * from, o->dense + 2 * DENSE * from);
     }
 }
 
@@ -269,18 +269,13 @@ WIDE int64_t joint_first(
     }
     num[1] = rows;
     if (rows > max_rows || used > max_scores) return NEEDS_NUMPY;
-    own_gram *sums = calloc(1, sizeof *sums);
-    gram_parts *parts = calloc(1, sizeof *parts);
-    if (!sums || !parts) {
-        free(sums), free(parts);
-        return NO_MEMORY;
-    }
-    add_own(m, &o, n, parts, sums);
+    own_gram sums ALIGNED = {0};
+    add_own(m, &o, n, &sums);
     memset(score, 0, FIELDS * sizeof *score);
     for (int64_t t = 0; t < num_tracks; t++) {
         for (int c = 0; c < FIELDS; c++) score[c] += track_score[t * FIELDS + c];
     }
-    spread_gram(sums, gram, plain, dense_plain);
+    spread_gram(&sums, gram, plain, dense_plain);
     memset(right, 0, (size_t)(rows * FIELDS) * sizeof *right);
     for (int64_t k = 0; k < near.num_images; k++) {
         int64_t begin = start[k], count = start[k + 1] - begin;
@@ -292,7 +287,7 @@ WIDE int64_t joint_first(
                 int64_t num_columns = width - column < ROWS ? width - column : ROWS;
                 for (int64_t v = 0; v < count; v += VIEWS) {
                     int64_t here = begin + v, num_views = count - v < VIEWS ? count - v : VIEWS;
-                    double through[VIEWS * 2 * ROWS];
+                    double through[VIEWS * 2 * ROWS] ALIGNED;
                     crossed(
                         m, view + here, own + here, num_views, near.num_views - here, first, blocks[b], column, absorbing, through,
                         scores + v * width);
@@ -303,7 +298,6 @@ WIDE int64_t joint_first(
         }
         if (around[k] == image) subtract_pairs(m, &o, view + begin, own + begin, count, gram);
     }
-    free(sums), free(parts);
     return DONE;
 }
 
@@ -343,7 +337,7 @@ INLINE void subtract_scores(double *const *to, int64_t count, int64_t width, con
 WIDE int64_t joint_second(
     const joint_model *m, int64_t num_around, const int32_t *own, const int64_t *around, const int64_t *start,
     const int32_t *track, const double *scores, const double *moved, double *track_score) {
-    double unused[FIELDS] = {0.0}; /* where a track had this view already */
+    double unused[FIELDS] ALIGNED = {0.0}; /* where a track had this view already */
     for (int64_t k = 0; k < num_around; k++) {
         int64_t widths[2] = {m->width, m->extra_first[around[k]] >= 0 ? m->extra_width[around[k]] : 0};
         for (int b = 0; b < 2; b++) {

@@ -8,6 +8,7 @@ typedef double wide __attribute__((vector_size(32), aligned(8), may_alias));
 
 enum { LANES = 4, SCALAR = 16, DENSE = 12, FIELDS = 2 * SCALAR + DENSE, ROWS = 8, MOST_COLUMNS = 32, AHEAD = 8 };
 
+#define ALIGNED __attribute__((aligned(64)))
 #define LOAD(address) (*(const wide *)(address))
 #define STORE(address) (*(wide *)(address))
 

@@ -2,7 +2,7 @@
  * section 11b; audit/joint/image_scores.py). */
 #include "joint.h"
 
-enum { TILE = 16, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64 };
+enum { TILE = 16, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64, LINE = 8 };
 
 /* S^+ (size, size) of the base: dense, or of a band by places, D^-1 (Y - A B^T - B A^T) D^-1 (audit/joint/banded.py). */
 typedef struct {
@@ -71,7 +71,7 @@ static inline __attribute__((always_inline)) int times_inverse(
     for (int64_t i = 0; i < inner; i += TILE) {
         int64_t rows = inner - i < TILE ? inner - i : TILE;
         for (int64_t j = i; j < inner; j += TILE) {
-            double tile[TILE * TILE];
+            double tile[TILE * TILE] ALIGNED;
             int64_t columns = inner - j < TILE ? inner - j : TILE;
             if (!entries_of(s, key, i, rows, j, columns, tile)) return 0;
             if (i == j) {
@@ -143,20 +143,27 @@ typedef struct {
     int32_t *view, *own, *track;
     int64_t *place, *around, *start, *column, *position;
     keyed *keys;
+    void *all[2]; /* what the first two rows above lie in */
 } workspace;
+
+/* Numbers that begin where a line of the cache does: vectors then never lie in two. */
+static double *lined_up(int64_t num, void **all) {
+    *all = malloc((size_t)(num + LINE) * sizeof(double));
+    return *all ? (double *)(((uintptr_t)*all + LINE * sizeof(double) - 1) / (LINE * sizeof(double)) * (LINE * sizeof(double))) : NULL;
+}
 
 static int has_room(workspace *w, int64_t num_images, int64_t width) {
     int64_t n = w->most_rows, v = w->most_views, c = w->most_columns;
-    w->xyz = malloc((size_t)(n * (3 + 2 + SCALAR + 2 * DENSE + 6 + FIELDS) + 1) * sizeof(double));
+    w->scalar = lined_up(n * (SCALAR + 2 * DENSE + FIELDS + 3 + 2 + 6), w->all);
+    w->right = lined_up(5 * c * FIELDS, w->all + 1);
     w->scores = malloc((size_t)(v * width + 1) * sizeof(double));
-    w->right = malloc((size_t)(5 * c * FIELDS + 1) * sizeof(double));
     w->view = malloc((size_t)(2 * v + n + 1) * sizeof(int32_t));
     w->place = calloc((size_t)(num_images + 1), sizeof(int64_t));
     w->around = malloc((size_t)(v + v + 1 + 2 * c + 1) * sizeof(int64_t));
     w->keys = malloc((size_t)(c + 1) * sizeof(keyed));
-    if (!w->xyz || !w->scores || !w->right || !w->view || !w->place || !w->around || !w->keys) return 0;
-    w->predicted = w->xyz + 3 * n, w->scalar = w->predicted + 2 * n, w->dense = w->scalar + SCALAR * n;
-    w->absorbing = w->dense + 2 * DENSE * n, w->track_score = w->absorbing + 6 * n;
+    if (!w->scalar || !w->scores || !w->right || !w->view || !w->place || !w->around || !w->keys) return 0;
+    w->dense = w->scalar + SCALAR * n, w->track_score = w->dense + 2 * DENSE * n;
+    w->xyz = w->track_score + FIELDS * n, w->predicted = w->xyz + 3 * n, w->absorbing = w->predicted + 2 * n;
     w->ordered = w->right + c * FIELDS, w->scaled = w->ordered + c * FIELDS, w->solution = w->scaled + c * FIELDS;
     w->moved = w->solution + c * FIELDS;
     w->own = w->view + v, w->track = w->own + v;
@@ -165,7 +172,7 @@ static int has_room(workspace *w, int64_t num_images, int64_t width) {
 }
 
 static void leave(workspace *w) {
-    free(w->xyz), free(w->scores), free(w->right), free(w->view), free(w->place), free(w->around), free(w->keys);
+    free(w->all[0]), free(w->all[1]), free(w->scores), free(w->view), free(w->place), free(w->around), free(w->keys);
 }
 
 /* Which distinct point each row shows, -1 - t where the row before it shows it too; returns how many there are. */
@@ -266,7 +273,7 @@ WIDE KERNEL int64_t joint_scores(
     const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t most_columns, int64_t widest, int64_t *status, int64_t *num_tracks,
     double *gram, double *meat, double *plain, double *dense_plain, double *score, double *right, double *solution) {
     int64_t width = m->width;
-    workspace w;
+    workspace w = {0};
     w.most_rows = most_rows, w.most_views = most_views, w.most_columns = most_columns;
     if (!has_room(&w, m->num_images, widest)) {
         leave(&w);
