@@ -17,61 +17,70 @@ typedef struct {
     const double *inverse[2], *pull[2]; /* (P, 3, 3), (P, 3) */
 } two_systems;
 
+enum { WIDES = MOST_COLUMNS / LANES };
+
+/* Two rows of numbers, x and y. */
+typedef struct {
+    wide x[WIDES], y[WIDES];
+} wide_rows;
+
+/* scale J a of a row's J (2, 3) and of a (3, padded). */
+INLINE void move_row(const double *jx, const double *jy, double scale, const double *a, int64_t padded, wide_rows *out) {
+    double x[3], y[3];
+    for (int i = 0; i < 3; i++) x[i] = scale * jx[i], y[i] = scale * jy[i];
+    for (int64_t d = 0; d < padded / LANES; d++) {
+        wide a0 = LOAD(a + LANES * d), a1 = LOAD(a + padded + LANES * d), a2 = LOAD(a + 2 * padded + LANES * d);
+        out->x[d] = x[0] * a0 + x[1] * a1 + x[2] * a2, out->y[d] = y[0] * a0 + y[1] * a1 + y[2] * a2;
+    }
+}
+
+/* to (padded, padded) += the product of a row's design (2, width), turned, and of the moved rows. */
+INLINE void add_outer(const double *dx, int64_t width, const wide_rows *moved, int64_t padded, double *to) {
+    const double *dy = dx + width;
+    for (int64_t c = 0; c < width; c++) {
+        double x = dx[c], y = dy[c];
+        for (int64_t d = 0; d < padded / LANES; d++) STORE(to + c * padded + LANES * d) += x * moved->x[d] + y * moved->y[d];
+    }
+}
+
 /* `padded` is the width, rounded up to LANES.
  *
- * slab (padded, padded): - W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the design
+ * slab (padded, padded): W_k V^-1 W^T between an image (columns) and one that sees its points too (rows, from the design
  * without T).    more_slab: what the second system has more: of points whose weights differ, all others say the same twice. */
 INLINE void add_slab(
     const joint_model *m, int64_t padded, const surroundings *near, int64_t k, const double *absorbed,
     const double *other_absorbed, const unsigned char *differs, double plain, double *slab, double *more_slab) {
     int64_t width = m->width;
-    pair_of_rows pair = {{0.0}, {0.0}};
-    double along[3][MOST_COLUMNS];
+    wide_rows moved, other;
     for (int64_t j = near->start[k]; j < near->start[k + 1]; j++) {
         soon(m, near->view, j, near->start[k + 1]);
-        const double *dx = m->design + near->view[j] * 2 * width, *dy = dx + width;
-        const double *own = absorbed + 3 * padded * near->own[j];
-        double w = m->weight[near->view[j]];
-        take_rows(dx, dy, width, &pair);
-        for (int i = 0; i < 3; i++) {
-            double x = dx[3 + i], y = dy[3 + i];
-            for (int64_t c = 0; c < padded; c++) along[i][c] = pair.x[c] * x + pair.y[c] * y;
-        }
-        for (int64_t c = 0; c < padded; c++) {
-            double a0 = w * along[0][c], a1 = w * along[1][c], a2 = w * along[2][c];
-            wide p0 = {a0, a0, a0, a0}, p1 = {a1, a1, a1, a1}, p2 = {a2, a2, a2, a2};
-            double *to = slab + c * padded;
-            for (int64_t d = 0; d < padded; d += LANES) {
-                STORE(to + d) -= p0 * LOAD(own + d) + p1 * LOAD(own + padded + d) + p2 * LOAD(own + 2 * padded + d);
-            }
-        }
-        if (!differs[near->own[j]]) continue;
-        const double *other = other_absorbed + 3 * padded * near->own[j];
-        for (int64_t c = 0; c < padded; c++) {
-            double *to = more_slab + c * padded;
-            for (int i = 0; i < 3; i++) {
-                double a = w * along[i][c], b = plain * along[i][c];
-                wide p = {a, a, a, a}, q = {b, b, b, b};
-                for (int64_t d = 0; d < padded; d += LANES) {
-                    STORE(to + d) += p * LOAD(own + i * padded + d) - q * LOAD(other + i * padded + d);
-                }
-            }
-        }
+        const double *dx = m->design + near->view[j] * 2 * width, *jx = dx + 3, *jy = jx + width;
+        int64_t own = near->own[j];
+        move_row(jx, jy, m->weight[near->view[j]], absorbed + 3 * padded * own, padded, &moved);
+        add_outer(dx, width, &moved, padded, slab);
+        if (!differs[own]) continue;
+        move_row(jx, jy, plain, other_absorbed + 3 * padded * own, padded, &other);
+        for (int64_t d = 0; d < padded / LANES; d++) other.x[d] -= moved.x[d], other.y[d] -= moved.y[d];
+        add_outer(dx, width, &other, padded, more_slab);
     }
+}
+
+/* out (width, padded): a matrix (width, width), zeros behind its last column. */
+INLINE void pad_square(const double *from, int64_t width, int64_t padded, double *out) {
+    memset(out, 0, (size_t)(width * padded) * sizeof *out);
+    for (int64_t c = 0; c < width; c++) memcpy(out + c * padded, from + c * width, (size_t)width * sizeof *out);
 }
 
 /* N (n, 2, padded) = design T of an image's rows, zeros behind the last column. T comes first: products of columns that all but
  * cancel in it (the depth of what a long lens sees) would lose twice the digits. */
 INLINE void turn_rows(
     const joint_model *m, int64_t padded, int64_t first, int64_t n, const double *transform, double *out) {
-    double turn[MOST_COLUMNS * MOST_COLUMNS] = {0.0};
+    double turn[MOST_COLUMNS * MOST_COLUMNS];
     int64_t width = m->width;
-    for (int64_t c = 0; c < width; c++) {
-        for (int64_t d = 0; d < width; d++) turn[c * padded + d] = transform[c * width + d];
-    }
+    pad_square(transform, width, padded, turn);
     for (int64_t row = 0; row < 2 * n; row++) {
         const double *given = m->design + (2 * first + row) * width;
-        wide sum[MOST_COLUMNS / LANES] = {{0}};
+        wide sum[WIDES] = {{0}};
         for (int64_t c = 0; c < width; c++) {
             for (int64_t d = 0; d < padded; d += LANES) sum[d / LANES] += given[c] * LOAD(turn + c * padded + d);
         }
@@ -201,7 +210,7 @@ INLINE void normal_of(
     turn_rows(m, padded, first, n, transform + image * square, space->nuisance);
     absorb_rows(m, of, plain, first, n, padded, space->nuisance, space->absorbed, space->other, space->differs);
     for (int64_t k = 0; k < near->num_images; k++) {
-        double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? 1.0 : 0.5;
+        double here[2][MOST_COLUMNS * MOST_COLUMNS], scale = k ? -1.0 : -0.5;
         const double *of_rows = transform + near->image[k] * square;
         memset(here[0], 0, (size_t)size * sizeof(double)), memset(here[1], 0, (size_t)size * sizeof(double));
         add_slab(
@@ -258,13 +267,19 @@ INLINE void meat_of(
     const int32_t *track, double *slab) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first, width = m->width;
     const surroundings *near = &space->near;
-    turn_rows(m, padded, first, n, transform + image * width * width, space->nuisance);
+    double turn[MOST_COLUMNS * MOST_COLUMNS];
+    pad_square(transform + image * width * width, width, padded, turn);
     memset(space->scores, 0, (size_t)(n * padded) * sizeof *space->scores);
     for (int64_t i = 0; i < n; i++) {
-        const double *own = space->nuisance + 2 * i * padded;
-        double x = m->weight[first + i] * m->left[2 * (first + i)], y = m->weight[first + i] * m->left[2 * (first + i) + 1];
+        const double *dx = m->design + (first + i) * 2 * width, *dy = dx + width, *left = m->left + 2 * (first + i);
+        double x = m->weight[first + i] * left[0], y = m->weight[first + i] * left[1];
         double *to = space->scores + padded * (track[i] < 0 ? -1 - track[i] : track[i]);
-        for (int64_t d = 0; d < padded; d += LANES) STORE(to + d) += x * LOAD(own + d) + y * LOAD(own + padded + d);
+        wide sum[WIDES] = {{0}};
+        for (int64_t c = 0; c < width; c++) {
+            double value = dx[c] * x + dy[c] * y;
+            for (int64_t d = 0; d < padded / LANES; d++) sum[d] += value * LOAD(turn + c * padded + LANES * d);
+        }
+        for (int64_t d = 0; d < padded / LANES; d++) STORE(to + LANES * d) += sum[d];
     }
     for (int64_t k = 0; k < near->num_images; k++) {
         double here[MOST_COLUMNS * MOST_COLUMNS];
