@@ -296,10 +296,11 @@ def _image_tests(
     found: dict[int, tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]] = {}
     for k, image in enumerate(asked):
         tests = {group: answers[k] for group, answers in by_group.items()}
+        told = {group: own for group, own in GROUP_COLUMNS.items() if tests[group].p < alpha}
+        depth = system.median_depth(image) if told else math.nan
         worth = {
-            group: worth_of(system, image, known[k], own, group_root(known[k], own))
-            for group, own in GROUP_COLUMNS.items()
-            if tests[group].p < alpha
+            group: worth_of(system, image, known[k], own, group_root(known[k], own), depth=depth)
+            for group, own in told.items()
         }
         found[image] = tests, worth
     nothing = dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS))

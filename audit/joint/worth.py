@@ -30,12 +30,15 @@ _AS_LARGE: Final = (
 NO_WORTH = Worth(math.nan, math.nan, math.nan)
 
 
-def worth_of(system: JointSystem, image_idx: int, scores: CandidateScores, own: slice, root: FloatArray) -> Worth:
+def worth_of(
+    system: JointSystem, image_idx: int, scores: CandidateScores, own: slice, root: FloatArray, *, depth: float
+) -> Worth:
     """Return by how much the base moves an image when a group of its fields is admitted.
 
     Parameters
     ----------
     root : L of `sfm_audit.audit.joint.group_test.group_root`
+    depth : of the image, `JointSystem.median_depth`
 
     Notes
     -----
@@ -52,7 +55,6 @@ def worth_of(system: JointSystem, image_idx: int, scores: CandidateScores, own: 
         return NO_WORTH
     change = -scores.solution[at, own] @ theta
     pose = layout.image_from_frame[image_idx] @ change[:NUM_POSE]
-    depth = system.median_depth(image_idx)
     return Worth(
         math.degrees(float(np.sqrt(pose[:3] @ pose[:3]))),
         float(np.sqrt(pose[3:] @ pose[3:])) / depth,

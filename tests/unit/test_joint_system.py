@@ -232,7 +232,7 @@ def test_worth_is_how_far_inclusion_moves_the_image(system, model):
     own, group = fields_of(system, 2), GROUP_COLUMNS[MisfitGroup.ROLLING_SHUTTER]
     scores = candidate_scores(system.base, [2], lambda _: own)
     root = group_root(scores, group)
-    worth = worth_of(system, 2, scores, group, root)
+    worth = worth_of(system, 2, scores, group, root, depth=system.median_depth(2))
     base = include(system.base, [Candidate(2, own.fields[:, :, group] @ root.T, own.nuisance.__getitem__)])
     columns = system.observations.layout.columns[2]
     moved = (base.step[: len(system.base.step)] - system.base.step)[columns]
