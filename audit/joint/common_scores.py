@@ -55,6 +55,7 @@ def common_scores(
     along = None if found is None else fields.right(found.absorbed)
     if found is None or along is None or not np.isfinite(along).all():
         return None
+    found = found._replace(absorbed=found.absorbed[:0])  # much memory that nobody needs any more
     right = _collected(layout.columns, observations.transform, along, layout.num_columns)
     support = np.arange(layout.num_columns, dtype=np.int64)
     solution = base.inverse.times(support, right)

@@ -6,11 +6,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from sfm_audit.audit.inliers.frames import cross_matrix
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.observations import JointObservations
+from sfm_audit.audit.kernels.joint_parts import components
 from sfm_audit.loaders.arrays import FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 NUM_GAUGE = 7
 
@@ -39,29 +39,30 @@ def components_of(observations: JointObservations) -> IntArray:
     layout = observations.layout
     num_images, num_points = len(layout.camera_idx), observations.num_points
     used = np.flatnonzero(layout.has_columns)
-    num_nodes = num_images + num_points + int(layout.frame_idx.max(initial=-1)) + 1
-    first = np.concatenate([observations.image_idx, used])
-    second = np.concatenate([num_images + observations.point_idx, num_images + num_points + layout.frame_idx[used]])
-    edges = sparse.coo_array((np.ones(first.size, dtype=np.int8), (first, second)), shape=(num_nodes, num_nodes))
-    _, label = connected_components(edges.tocsr(), directed=False)
-    return np.where(layout.has_columns, label[:num_images], -1).astype(np.int64)
+    together = np.arange(num_images)
+    together[used] = used[np.unique(layout.frame_idx[used], return_index=True)[1]][layout.frame_idx[used]]
+    label = components(observations.index, together)
+    if label is None:
+        num_nodes = num_images + num_points
+        first = np.concatenate([observations.image_idx, used])
+        second = np.concatenate([num_images + observations.point_idx, together[used]])
+        edges = sparse.coo_array((np.ones(first.size, dtype=np.int8), (first, second)), shape=(num_nodes, num_nodes))
+        label = connected_components(edges.tocsr(), directed=False)[1][:num_images].astype(np.int64)
+    return np.where(layout.has_columns, label, -1)
 
 
 def _of_component(model: SparseModel, observations: JointObservations, images: IntArray) -> FloatArray:
     layout = observations.layout
-    records = [model.image(i) for i in images.tolist()]
-    rotation = np.array([record.rotation_cam_from_world for record in records])
-    shift = np.array([record.translation_cam_from_world for record in records])
+    rotation = rotation_from_quat(model.images.quat_cam_from_world_wxyz[images])
+    shift = model.images.translation_cam_from_world[images]
     centres = -np.einsum("iba,ib->ia", rotation, shift)
     shift = shift + rotation @ np.median(centres, axis=0)  # coordinates far from zero would cost digits
     out = np.zeros((layout.num_columns, NUM_GAUGE))
     _, first = np.unique(layout.frame_idx[images], return_index=True)
-    for k in first.tolist():
-        own = np.zeros((NUM_POSE, NUM_GAUGE))
-        own[3:, :3] = -rotation[k]
-        own[:3, 3:6] = -rotation[k]
-        own[3:, 3:6] = -cross_matrix(shift[k]) @ rotation[k]
-        own[3:, 6] = shift[k]
-        image = int(images[k])
-        out[layout.pose_of_image(image)] = np.linalg.solve(layout.image_from_frame[image], own)
+    rotation, shift, chosen = rotation[first], shift[first], images[first]
+    own = np.zeros((first.size, NUM_POSE, NUM_GAUGE))
+    own[:, 3:, :3] = own[:, :3, 3:6] = -rotation
+    own[:, 3:, 3:6] = np.cross(rotation, shift[:, :, None], axis=1)
+    own[:, 3:, 6] = shift
+    out[layout.columns[chosen, :NUM_POSE]] = np.linalg.solve(layout.image_from_frame[chosen], own)
     return out

@@ -21,7 +21,7 @@ _FACTS: Final = 27
 class CommonGram(NamedTuple):
     """E^T w O E of c fields E, one unknown each; O takes values off the points.
 
-    absorbed: (P, 3, 8) V^-1 J^T w E.    gram: (c, c).    sq_length, score: (c,) E^T w E and E^T w y~.
+    absorbed: (P, 3, 4 or 8) V^-1 J^T w E.    gram: (c, c).    sq_length, score: (c,) E^T w E and E^T w y~.
     is_seen: (P,) whether an image with the fields sees a point.
     """
 
@@ -55,7 +55,9 @@ class CommonFields:
         images = ints(asked.images, count)
         if count and not (images.min() >= 0 and images.max() < sums.num_images):
             raise ValueError(f"images: expected 0 .. {sums.num_images - 1}")
-        padded = np.zeros((FIELDS, COMMON))
+        self._halves = 1 if 2 * self._num_fields <= COMMON else 2
+        self._width = self._halves * COMMON // 2
+        padded = np.zeros((FIELDS, self._width))
         padded[:, : self._num_fields] = made_of
         has_facts = len(asked.facts) > 0 or not count
         facts = doubles(asked.facts, (count if has_facts else 0, _FACTS))
@@ -72,38 +74,38 @@ class CommonFields:
 
     def gram(self) -> CommonGram | None:
         """Return the sums of the fields among themselves; None for the numpy path."""
-        function = kernel("joint_common_gram", *_MODEL, Size, Size, Ints, *([Doubles] * 4), Bytes)
+        function = kernel("joint_common_gram", Size, *_MODEL, Size, Size, Ints, *([Doubles] * 4), Bytes)
         if function is None:
             return None
         num_points, count = self._sums.num_points, self._num_fields
-        absorbed, gram = np.empty((num_points, 3, COMMON)), np.empty((COMMON, COMMON))
-        length, score = np.empty((2, COMMON))
+        absorbed, gram = np.empty((num_points, 3, self._width)), np.empty((self._width, self._width))
+        length, score = np.empty((2, self._width))
         is_seen = np.empty(num_points, dtype=np.uint8)
         given = num_points, len(self._images), self._images
-        if function(*self._model(), *given, absorbed, gram, length, score, is_seen) != DONE:
+        if function(self._halves, *self._model(), *given, absorbed, gram, length, score, is_seen) != DONE:
             return None
         return CommonGram(absorbed, gram[:count, :count], length[:count], score[:count], is_seen.astype(bool))
 
     def right(self, absorbed: FloatArray) -> FloatArray | None:
         """(I, C, c) design^T w O E, by image; ``absorbed`` of `gram`."""
-        function = kernel("joint_common_right", *_MODEL, Ints, Doubles, Doubles)
-        out = np.empty((self._sums.num_images, self._sums.width, COMMON))
-        given = doubles(absorbed, (self._sums.num_points, 3, COMMON))
-        if function is None or function(*self._model(), self._is_own, given, out) != DONE:
+        function = kernel("joint_common_right", Size, *_MODEL, Ints, Doubles, Doubles)
+        out = np.empty((self._sums.num_images, self._sums.width, self._width))
+        given = doubles(absorbed, (self._sums.num_points, 3, self._width))
+        if function is None or function(self._halves, *self._model(), self._is_own, given, out) != DONE:
             return None
         return out[:, :, : self._num_fields]
 
     def track_scores(self, moved: FloatArray) -> FloatArray | None:
         """(P, c) sum over the views of each point of w y~^T (E - N B); ``moved`` (I, C, c): T B of each image."""
-        function = kernel("joint_common_tracks", *_MODEL, Size, Ints, Doubles, Doubles)
+        function = kernel("joint_common_tracks", Size, *_MODEL, Size, Ints, Doubles, Doubles)
         num_points = self._sums.num_points
-        padded = np.zeros((self._sums.num_images, self._sums.width, COMMON))
+        padded = np.zeros((self._sums.num_images, self._sums.width, self._width))
         padded[:, :, : self._num_fields] = moved
-        out = np.empty((num_points, COMMON))
+        out = np.empty((num_points, self._width))
         given = num_points, self._is_own, padded
         return (
             out[:, : self._num_fields]
-            if function is not None and function(*self._model(), *given, out) == DONE
+            if function is not None and function(self._halves, *self._model(), *given, out) == DONE
             else None
         )
 

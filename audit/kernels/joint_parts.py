@@ -145,6 +145,23 @@ def in_order_of_sight(image_idx: Int32Array, point_idx: Int32Array, offsets: Int
     return Sight(points[:count].copy(), order, new_idx, by_point, starts[: count + 1].copy())
 
 
+def components(index: JointIndex, together: IntArray) -> IntArray | None:
+    """(I,) the first image that each image hangs together with by points; None for the numpy path.
+
+    Parameters
+    ----------
+    together : (I,) an image that each hangs together with anyway, itself or one before it
+    """
+    function = kernel("joint_components", Size, Size, Ints, SmallInts, Ints)
+    label, arrays = ints(together, index.num_images).copy(), index.arrays
+    if not ((label >= 0) & (label <= np.arange(label.size))).all():
+        raise ValueError("together: expected images that are not behind")
+    if function is None:
+        return None
+    function(index.num_images, index.num_points, arrays["point_offsets"], arrays["image_of"], label)
+    return label
+
+
 class TwoInformations(NamedTuple):
     """V (P, 3, 3) and the pull J^T w y (P, 3) of two systems."""
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, with_rig
 from numpy.testing import assert_allclose
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
@@ -17,6 +19,7 @@ from sfm_audit.audit.joint import audit_jointly, misfit
 from sfm_audit.audit.joint import common_scores as common_score_module
 from sfm_audit.audit.joint.candidates import FieldsInParts, candidate_scores
 from sfm_audit.audit.joint.common_scores import common_scores
+from sfm_audit.audit.joint.gauge import components_of
 from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.image_scores import scores_of_many
 from sfm_audit.audit.joint.implied import ImpliedBeside, _missing_fields, _shift_fields, next_power
@@ -29,6 +32,7 @@ from sfm_audit.audit.kernels import kernels_in_use, numpy_only
 from sfm_audit.audit.kernels.joint import JointArrays, JointIndex, JointSums
 from sfm_audit.audit.kernels.joint_normal import OtherSystem, meats, normals
 from sfm_audit.audit.kernels.joint_parts import (
+    components,
     dense_entries,
     near_entries,
     point_information,
@@ -309,6 +313,35 @@ def test_an_image_without_observations_has_nothing_around():
     assert sums.index.tracks(1) == (pytest.approx([0, 1, 2, -1, -2, -3]), 3)
     assert not sums.repeats_follow
     assert JointSums(small_arrays()).repeats_follow
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_images_that_hang_together_are_those_of_the_graph(seed):
+    """Points of one view and of several, frames of two images, images that see nothing."""
+    rng = np.random.default_rng(seed)
+    image_idx, point_idx = np.sort(rng.integers(0, 30, 40)), rng.integers(0, 25, 40)
+    by_point = np.argsort(point_idx, kind="stable")
+    offsets, point_offsets = (
+        np.concatenate([[0], np.cumsum(np.bincount(of, minlength=n))]) for of, n in ((image_idx, 32), (point_idx, 25))
+    )
+    index = JointIndex(offsets, image_idx, point_idx, by_point, point_offsets)
+    together = np.arange(32)
+    together[[5, 9, 31]] = [2, 5, 30]
+    edges = np.concatenate([image_idx, np.arange(32)]), np.concatenate([32 + point_idx, together])
+    graph = sparse.coo_array((np.ones(72), edges), shape=(57, 57))
+    expected = connected_components(graph, directed=False)[1][:32]
+    found = components(index, together)
+    assert found.tolist() == [int(np.flatnonzero(expected == label)[0]) for label in expected]
+    with pytest.raises(ValueError, match="not behind"):
+        components(index, together + 1)
+
+
+def test_components_of_a_model_are_the_same(both):
+    found = components_of(both.plain.observations)
+    with numpy_only():
+        expected = components_of(both.plain.observations)
+    assert (found[:, None] == found).tolist() == (expected[:, None] == expected).tolist()
+    assert ((found < 0) == (expected < 0)).all()
 
 
 def test_points_whose_weight_is_zero_add_nothing_whatever_they_are():

@@ -164,6 +164,34 @@ KERNEL int64_t joint_by_sight(
     return count;
 }
 
+/* The first of all that a number hangs on, which then hangs on it. */
+static int64_t first_of(int64_t *label, int64_t k) {
+    int64_t root = k;
+    while (label[root] != root) root = label[root];
+    while (label[k] != root) {
+        int64_t next = label[k];
+        label[k] = root, k = next;
+    }
+    return root;
+}
+
+/* Which images hang together: those that see a point, and those that hung together before.
+ *
+ * point_offsets (num_points + 1), image_of: who sees each point.    label (num_images): an image that each hangs on, none behind
+ * it; afterwards the first of all. */
+KERNEL int64_t joint_components(
+    int64_t num_images, int64_t num_points, const int64_t *point_offsets, const int32_t *image_of, int64_t *label) {
+    for (int64_t point = 0; point < num_points; point++) {
+        int64_t start = point_offsets[point], end = point_offsets[point + 1];
+        for (int64_t k = start + 1; k < end; k++) {
+            int64_t one = first_of(label, image_of[start]), other = first_of(label, image_of[k]);
+            if (one != other) label[one > other ? one : other] = one > other ? other : one;
+        }
+    }
+    for (int64_t image = 0; image < num_images; image++) label[image] = first_of(label, image);
+    return DONE;
+}
+
 /* V (P, 3, 3) and J^T w y (P, 3) with two weights at once, of the design's columns.
  *
  * weight (n), values (n, 2) y, point_idx (n); plain (num_images): the second weight, of all rows of an image. */
