@@ -236,7 +236,17 @@ def simulated(gamma: float, rng: np.random.Generator) -> tuple[ModelResiduals, i
     empty = np.zeros(num_images, dtype=np.int64)
     offsets = np.arange(num_images + 1) * num_points
     residuals = ModelResiduals(
-        offsets, np.arange(n), point_idx, noise, jacobian, np.zeros(num_images), (), empty, empty, empty, empty
+        offsets,
+        np.arange(n, dtype=np.int32),
+        point_idx,
+        noise,
+        jacobian,
+        np.zeros(num_images),
+        (),
+        empty,
+        empty,
+        empty,
+        empty,
     )
     rows = jacobian.transpose(2, 0, 1)
     information, gradient = np.zeros((num_points, 3, 3)), np.zeros((num_points, 3))

@@ -12,12 +12,13 @@ from sfm_audit.audit.inliers.sanity import params_of, usable_cameras
 from sfm_audit.audit.inliers.small import SmallImages, groups, project_small
 from sfm_audit.audit.inliers.stationarity import offsets_of_sums
 from sfm_audit.audit.kernels.projection import LENSES, NO_LENS, NUM_PARAMS, Projected, Scene, project_scene
-from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray, distinct
 from sfm_audit.loaders.camera_models import BY_ID
 from sfm_audit.loaders.model import SparseModel
 
 _INLIERS, _DANGLING, _BEHIND, _NONFINITE, _UNPROJECTED = range(5)
 _NUM_COUNTS: Final = 5
+_TOO_MANY: Final = 1 << 31  # for rows of 32 bits; their derivatives alone would take 100 GB
 _Number = TypeVar("_Number", bound=np.number[Any])
 
 
@@ -34,6 +35,8 @@ class Kept:
 
     def __init__(self, model: SparseModel) -> None:
         num_images, capacity = len(model.images), len(model.observations)
+        if capacity >= _TOO_MANY:
+            raise ValueError(f"expected fewer than 2^31 observations, found {capacity}")
         self._first = model.observations.offsets
         self.pose_offset_px: FloatArray = np.full(num_images, np.nan)
         self._extra: list[FloatArray] = [np.empty((0, 2, 0))] * num_images
@@ -43,7 +46,7 @@ class Kept:
         self.pose_sums: tuple[FloatArray, FloatArray] | None = None
         found = project_scene(scene_of(model))
         if found is None:
-            self.rows: IntArray = np.empty(capacity, dtype=np.int64)
+            self.rows: Int32Array = np.empty(capacity, dtype=np.int32)
             self.residuals_px, self.point_jacobian = np.empty((2, capacity)), np.empty((2, 3, capacity))
         else:
             self.rows, self.residuals_px, self.point_jacobian = found.rows, found.residuals_px, found.point_jacobian
@@ -96,7 +99,7 @@ class Kept:
         """Keep the inliers (n,) of an image, given as rows of its linked observations."""
         first = int(self._first[image_idx])
         own = slice(first, first + inlier_row.size)
-        np.add(inlier_row, first, out=self.rows[own])
+        self.rows[own] = inlier_row + first
         self.residuals_px[:, own] = residuals_px
         self.point_jacobian[:, :, own] = point_jacobian
         self._extra[image_idx] = d_extra

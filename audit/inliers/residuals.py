@@ -19,7 +19,7 @@ from sfm_audit.audit.inliers.sanity import (
     is_usable,
 )
 from sfm_audit.audit.inliers.stationarity import pose_offset_px, pose_offsets_px
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel, rotation_from_quat
 
 _MAX_JOINED: Final = 64
@@ -68,7 +68,7 @@ class ModelResiduals:
     """
 
     offsets: IntArray
-    observation_row: IntArray
+    observation_row: Int32Array
     point_idx: IntArray
     residuals_px: FloatArray
     point_jacobian: FloatArray

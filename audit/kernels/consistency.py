@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.kernels.library import Double, Doubles, Ints, Size, kernel
+from sfm_audit.audit.kernels.checked import small_ints
+from sfm_audit.audit.kernels.library import Double, Doubles, Ints, Size, SmallInts, kernel
 from sfm_audit.audit.kernels.threads import over_ranges
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 NOTHING, RMS, AFFINE = 0, 1, 2
 """What is wanted of an image."""
@@ -37,7 +38,7 @@ class Fitted:
 def fit_images(
     offsets: IntArray,
     residuals_px: FloatArray,
-    rows: IntArray,
+    rows: Int32Array,
     xy_px: FloatArray,
     *,
     wanted: IntArray,
@@ -57,7 +58,9 @@ def fit_images(
     IndexError
         where an offset or a row does not fit its table.
     """
-    function = kernel("sfm_consistency", Size, Size, Ints, Size, Doubles, Ints, Doubles, Ints, Double, Doubles, Ints)
+    function = kernel(
+        "sfm_consistency", Size, Size, Ints, Size, Doubles, SmallInts, Doubles, Ints, Double, Doubles, Ints
+    )
     if function is None:
         return None
     num_images, total = len(wanted), residuals_px.shape[1]
@@ -74,7 +77,7 @@ def fit_images(
     ):
         raise IndexError("an offset or a row points outside of its table")
     values, status = np.zeros((num_images, _NUM_VALUES)), np.ones(num_images, dtype=np.int64)
-    arrays = (offsets, total, residuals_px, rows, xy_px, wanted, knee, values, status)
+    arrays = (offsets, total, residuals_px, small_ints(rows, total), xy_px, wanted, knee, values, status)
     over_ranges(lambda start, stop: function(start, stop, *arrays), num_images, lengths)
     pairs = values[:, :10].reshape(num_images, 5, 2)
     return Fitted(status == 0, pairs[:, :2], pairs[:, 2], pairs[:, 3], pairs[:, 4], *values[:, 10:].T)

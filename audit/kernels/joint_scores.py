@@ -12,7 +12,7 @@ import numpy.typing as npt
 from sfm_audit.audit.kernels.checked import doubles, ints, small_ints
 from sfm_audit.audit.kernels.joint import DENSE, DONE, FIELDS, SCALAR, JointSums
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
 _FACTS: Final = 27
 
@@ -60,7 +60,7 @@ class SeenArrays:
     xyz_world: FloatArray
     xy_px: FloatArray
     residuals_px: FloatArray
-    observation_row: IntArray
+    observation_row: Int32Array
     points: IntArray
     source: IntArray
 

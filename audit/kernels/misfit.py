@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
@@ -26,7 +27,7 @@ _WINDOW: Final = (
     Doubles,
     Ints,
     Doubles,
-    Ints,
+    SmallInts,
     _Strided,
     Size,
     _Strided,
@@ -45,7 +46,7 @@ class Observed:
     xyz_world: FloatArray
     xy_px: FloatArray
     point_idx: IntArray
-    observation_row: IntArray
+    observation_row: Int32Array
     residuals_px: FloatArray
     point_jacobian: FloatArray
 
@@ -63,12 +64,12 @@ class Observed:
         cls,
         xyz_world: FloatArray,
         xy_px: FloatArray,
-        rows: tuple[IntArray, IntArray],
+        rows: tuple[IntArray, Int32Array],
         residuals_px: FloatArray,
         point_jacobian: FloatArray,
     ) -> Observed:
         """Take the arrays as they are where they have the types of the kernels; ``rows`` of points and 2D points."""
-        point_idx, observation_row = (np.ascontiguousarray(each, dtype=np.int64) for each in rows)
+        point_idx, observation_row = np.ascontiguousarray(rows[0], dtype=np.int64), small_ints(rows[1], len(rows[1]))
         residuals_px, point_jacobian = (
             each if each.dtype == np.float64 and _is_by_rows(each) else np.ascontiguousarray(each, dtype=np.float64)
             for each in (residuals_px, point_jacobian)

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
 from sfm_audit.audit.kernels.threads import over_ranges
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
 
 LENSES: Final[dict[str, int]] = {
     "SIMPLE_PINHOLE": 0,
@@ -74,7 +74,7 @@ class Projected:
     pose_gram: (I, 6, 6) products of the columns of each pose.    pose_right: (I, 6) of these and the residuals.
     """
 
-    rows: IntArray
+    rows: Int32Array
     residuals_px: FloatArray
     point_jacobian: FloatArray
     extra: FloatArray
@@ -97,7 +97,7 @@ def project_scene(scene: Scene) -> Projected | None:
     function = kernel(
         "sfm_project",
         *(Size, Size, Ints, Ints, Doubles, Doubles, Doubles, Doubles, Ints, Ints, Doubles),
-        *(Size, Ints, Doubles, Doubles, Ints, Doubles, Ints, Doubles, Ints),
+        *(Size, SmallInts, Doubles, Doubles, Ints, Doubles, Ints, Doubles, Ints),
     )
     if function is None:
         return None
@@ -106,7 +106,7 @@ def project_scene(scene: Scene) -> Projected | None:
     num_linked = np.diff(scene.offsets)
     num_extra = np.where(scene.camera_idx < 0, 0, np.append(scene.lenses[:, 2], 0)[scene.camera_idx])
     extra_offsets = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(2 * num_extra * num_linked)])
-    rows, status = np.empty(capacity, dtype=np.int64), np.empty(num_images, dtype=np.int64)
+    rows, status = np.empty(capacity, dtype=np.int32), np.empty(num_images, dtype=np.int64)
     residuals, jacobian = np.empty((2, capacity)), np.empty((2, 3, capacity))
     extra, counts = np.empty(int(extra_offsets[-1])), np.zeros((num_images, NUM_COUNTS), dtype=np.int64)
     sums = np.zeros((num_images, NUM_SUMS))

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.audit.kernels.checked import small_ints
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
 
 class Inliers(NamedTuple):
@@ -18,7 +19,7 @@ class Inliers(NamedTuple):
     """
 
     offsets: IntArray
-    observation_row: IntArray
+    observation_row: Int32Array
     point_idx: IntArray
     xy_px: FloatArray
     xyz_world: FloatArray
@@ -46,14 +47,30 @@ def image_spread(inliers: Inliers, image_idxs: IntArray, size_px: FloatArray, gr
     IndexError
         where an index or an offset does not fit its table.
     """
-    types = (Size, Ints, Ints, Ints, Ints, Doubles, Doubles, Doubles, Doubles, Doubles, Size, Doubles, Ints, Doubles)
+    types = (
+        Size,
+        Ints,
+        Ints,
+        SmallInts,
+        Ints,
+        Doubles,
+        Doubles,
+        Doubles,
+        Doubles,
+        Doubles,
+        Size,
+        Doubles,
+        Ints,
+        Doubles,
+    )
     run = kernel("image_spread", *types)
     if run is None:
         return None
     _check(inliers, image_idxs)
     num = len(image_idxs)
     out = Lie(np.empty(num), np.empty(num, dtype=np.int64), np.empty(num))
-    rows = (np.ascontiguousarray(each, dtype=np.int64) for each in inliers[:3])
+    offsets, point_idx = (np.ascontiguousarray(each, dtype=np.int64) for each in (inliers.offsets, inliers.point_idx))
+    rows = offsets, small_ints(inliers.observation_row, len(inliers.observation_row)), point_idx
     values = (np.ascontiguousarray(each, dtype=np.float64) for each in inliers[3:])
     sizes = np.ascontiguousarray(size_px, dtype=np.float64)
     status = run(num, np.ascontiguousarray(image_idxs, dtype=np.int64), *rows, *values, sizes, grid, *out)

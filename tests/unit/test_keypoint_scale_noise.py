@@ -36,7 +36,17 @@ def simulate(rng, gamma, *, num_images=6, num_points=600, nu0=4.0, spread=0.6, c
     none = np.zeros(num_images, dtype=np.int64)
     offsets = np.arange(num_images + 1) * num_points
     residuals = ModelResiduals(
-        offsets, np.arange(n), point_idx, noise, jacobian, np.zeros(num_images), (), none, none, none, none
+        offsets,
+        np.arange(n, dtype=np.int32),
+        point_idx,
+        noise,
+        jacobian,
+        np.zeros(num_images),
+        (),
+        none,
+        none,
+        none,
+        none,
     )
     return at_optimum(residuals, num_points), scale_px
 

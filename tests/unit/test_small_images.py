@@ -9,6 +9,7 @@ import pytest
 from kernel_samples import model_with
 from numpy.testing import assert_allclose, assert_array_equal
 
+from sfm_audit.audit.inliers import kept
 from sfm_audit.audit.inliers.residuals import image_residuals, model_residuals
 from sfm_audit.audit.inliers.small import groups, project_small
 from sfm_audit.audit.kernels import numpy_only
@@ -98,3 +99,11 @@ def test_an_observation_that_is_no_inlier_leaves_each_image_to_itself(fault):
     )
     assert project_small(model, np.array([0, 2, 3, 5])) is None or fault == "rounding"
     assert_each_by_itself(model)
+
+
+def test_rows_of_observations_fit_32_bits_or_nothing_is_audited(monkeypatch):
+    model = shared("SIMPLE_RADIAL")
+    assert model_residuals(model).observation_row.dtype == np.int32
+    monkeypatch.setattr(kept, "_TOO_MANY", len(model.observations))
+    with pytest.raises(ValueError, match=r"fewer than 2\^31 observations"):
+        model_residuals(model)

@@ -138,7 +138,7 @@ INLINE double leave(const Image *im, double c[NUM_TERMS][2]) {
 }
 
 /* Residuals, projected points and padding of an image. */
-INLINE void fill(Image *im, const double *residuals, int64_t total, const int64_t *rows, const double *xy_px) {
+INLINE void fill(Image *im, const double *residuals, int64_t total, const int32_t *rows, const double *xy_px) {
     for (int64_t k = 0; k < im->n; k++) {
         const double rx = residuals[k], ry = residuals[total + k];
         im->rx[k] = im->ex[k] = rx, im->ry[k] = im->ey[k] = ry;
@@ -172,7 +172,7 @@ INLINE double spread_of(Image *im, const double *design, double size) {
     return sqrt(sum_of(im->weights, im->n) / (double)im->n) * size;
 }
 
-WIDE static int fit(Image *im, const double *residuals, int64_t total, const int64_t *rows, const double *xy_px,
+WIDE static int fit(Image *im, const double *residuals, int64_t total, const int32_t *rows, const double *xy_px,
                     int with_affine, double *out) {
     const double n = (double)im->n, largest = MAX_MAGNITUDE * MAX_MAGNITUDE * n;
     fill(im, residuals, total, rows, xy_px);
@@ -220,7 +220,7 @@ WIDE static int fit(Image *im, const double *residuals, int64_t total, const int
  * (2, 2), shift, centre and spread (2), median, RMS of what is left, RMS of the residuals. Returns how many images are
  * left to numpy. */
 KERNEL int64_t sfm_consistency(int64_t first, int64_t last, const int64_t *offsets, int64_t total,
-                               const double *residuals, const int64_t *rows, const double *xy_px,
+                               const double *residuals, const int32_t *rows, const double *xy_px,
                                const int64_t *wanted, double knee, double *out, int64_t *status) {
     int64_t most = LANES, num_left = 0;
     for (int64_t image = first; image < last; image++) {

@@ -24,7 +24,9 @@ typedef double row_t[SIZE] __attribute__((aligned(64)));
 /* The model, as it lies in memory. residuals: 2 rows, jacobian: 6 rows of these strides. */
 typedef struct {
     const double *xyz_world, *xy_px, *residuals, *jacobian;
-    const int64_t *point, *observation, *facts;
+    const int64_t *point;
+    const int32_t *observation;
+    const int64_t *facts;
     int64_t residual_stride, jacobian_stride;
 } model_t;
 
@@ -322,7 +324,7 @@ static void write_sums(const sums_t *s, int q, double *gram, double *on_y) {
 #define WINDOW                                                                                                         \
     int64_t num_images, const int64_t *rows, const double *numbers, const double *extra, const int64_t *extra_offsets, \
         const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,                      \
-        const int64_t *observation, const double *residuals, int64_t residual_stride, const double *jacobian,          \
+        const int32_t *observation, const double *residuals, int64_t residual_stride, const double *jacobian,          \
         int64_t jacobian_stride
 #define MODEL {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride}
 #define IMAGE(i) {rows[2 * (i)], rows[2 * (i) + 1], numbers + NUM_NUMBERS * (i), extra + extra_offsets[i]}

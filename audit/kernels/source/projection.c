@@ -339,7 +339,8 @@ typedef struct {
     int64_t capacity;
     double *residuals, *jacobian, *extra, *pose_sums;
     const int64_t *extra_offsets;
-    int64_t *rows, *counts;
+    int32_t *rows;
+    int64_t *counts;
 } Found;
 
 /* Sums over an image. lanes: of products of pose columns (upper triangle), then of columns and residuals. */
@@ -480,7 +481,7 @@ INLINE void add_largest(const Block *b, Sums *sums) {
 
 /* Residuals, derivatives in the point in the world frame (J R), and in the distortion, behind what is there. */
 INLINE void store(const Block *b, const Found *f, const double *rotation, int64_t at) {
-    memcpy(f->rows + at, b->row, sizeof(int64_t) * (size_t)b->n);
+    EACH(k, b) f->rows[at + k] = (int32_t)b->row[k];
     for (int axis = 0; axis < 2; axis++) {
         memcpy(f->residuals + axis * f->capacity + at, b->residual[axis], sizeof(double) * (size_t)b->n);
         const Column *j = b->jac[axis];
@@ -552,7 +553,7 @@ WIDE static int project_image(const Scene *s, const Found *f, int64_t image, Blo
 KERNEL int64_t sfm_project(int64_t first, int64_t last, const int64_t *offsets, const int64_t *point_idx,
                            const double *xy_px, const double *xyz_world, const double *quaternions,
                            const double *translations, const int64_t *camera_idx, const int64_t *lenses,
-                           const double *params, int64_t capacity, int64_t *rows, double *residuals, double *jacobian,
+                           const double *params, int64_t capacity, int32_t *rows, double *residuals, double *jacobian,
                            const int64_t *extra_offsets, double *extra, int64_t *counts, double *pose_sums,
                            int64_t *status) {
     const Scene scene = {offsets, point_idx, camera_idx, lenses, xy_px, xyz_world, quaternions, translations, params};

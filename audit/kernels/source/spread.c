@@ -205,7 +205,7 @@ static double median(double *values, int64_t n, double *within)
 /* images: (num,) rows of the image table; their inliers are offsets[i] .. offsets[i + 1] of observation_row, point_idx.
  * quaternions (I, 4), translations (I, 3): cam_from_world. size_px: (num, 2). Out, (num,) each: hull_px2,
  * occupied_cells, depth: median Zc. */
-KERNEL int64_t image_spread(int64_t num, const int64_t *images, const int64_t *offsets, const int64_t *observation_row,
+KERNEL int64_t image_spread(int64_t num, const int64_t *images, const int64_t *offsets, const int32_t *observation_row,
                             const int64_t *point_idx, const double *xy_px, const double *xyz_world,
                             const double *quaternions, const double *translations, const double *size_px, int64_t grid,
                             double *hull_px2, int64_t *occupied_cells, double *depth)
