@@ -191,8 +191,9 @@ def _of_camera(camera: CameraRecord) -> tuple[Sequence[int], Sequence[int]]:
 
 
 def _squares(plain: FloatArray, dense_plain: FloatArray) -> FloatArray:
-    """(.., 44, 44) w E^T E, as far as lengths of fields need it: no field mixes dense functions with scalar ones."""
+    """(.., 44, 44) w E^T E, as far as lengths of fields need it: none mixes a dense function with any other."""
     out = np.zeros((*plain.shape[:-2], FIELDS, FIELDS))
     out[..., :SCALAR, :SCALAR] = out[..., SCALAR:_BOTH, SCALAR:_BOTH] = plain
-    out[..., _BOTH:, _BOTH:] = dense_plain
+    dense = np.arange(_BOTH, FIELDS)
+    out[..., dense, dense] = dense_plain
     return out

@@ -78,7 +78,7 @@ class Scores(NamedTuple):
     """What `JointScores.of` says of k images; F = 44 functions, C columns of an image.
 
     done: (k,) whether the rest holds.    num_tracks: (k,).    gram, meat: (k, F, F).
-    plain: (k, 16, 16), dense_plain: (k, 12, 12) w E^T E of scalars and of dense fields.    score: (k, F).
+    plain: (k, 16, 16) w E^T E of scalars.    dense_plain: (k, 12) its diagonal for dense fields.    score: (k, F).
     right, solution: (k, C, F) R and B = S^+ R at the image's own columns, zero where it has none.
     """
 
@@ -211,7 +211,7 @@ class JointScores:
             return None
         status, num_tracks = np.ones(k, dtype=np.int64), np.zeros(k, dtype=np.int64)
         gram, meat = np.empty((2, k, FIELDS, FIELDS))
-        plain, dense_plain = np.empty((k, SCALAR, SCALAR)), np.empty((k, DENSE, DENSE))
+        plain, dense_plain = np.empty((k, SCALAR, SCALAR)), np.empty((k, DENSE))
         score, right, solution = np.empty((k, FIELDS)), np.empty((k, width, FIELDS)), np.empty((k, width, FIELDS))
         given = images, doubles(asked.facts, (k, _FACTS)), ints(asked.is_fisheye, k), ints(asked.power, k)
         found = num_tracks, gram, meat, plain, dense_plain, score, right, solution

@@ -86,12 +86,12 @@ static inline int moment_of(int a, int b) { return (a + b) * (a + b + 1) / 2 + b
 /* Sums of products of own fields with weights P (2, 2): half of E^T P E. Scalars times scalars are moments of the point. */
 typedef struct {
     double moments[4][MOMENTS]; /* by P_xx, P_xy, P_yy, w */
-    double mixed[2][SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE][DENSE];
+    double mixed[2][SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE]; /* w E^T E of the dense fields: its diagonal */
 } own_gram;
 
 /* What add_gram needs of each of some observations. */
 typedef struct {
-    double moment[OBSERVATIONS][MOMENTS], by_p[OBSERVATIONS][2][DENSE], by_w[OBSERVATIONS][2][DENSE], p[OBSERVATIONS][4];
+    double moment[OBSERVATIONS][MOMENTS], by_p[OBSERVATIONS][2][DENSE], p[OBSERVATIONS][4];
 } gram_parts;
 
 /* Add some observations, at most OBSERVATIONS: parts->p has P_xx, P_xy, P_yy and w of each. */
@@ -107,7 +107,7 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
         for (int j = 0; j < DENSE; j++) {
             double x = d[j], y = d[DENSE + j];
             parts->by_p[i][0][j] = p[0] * x + p[1] * y, parts->by_p[i][1][j] = p[1] * x + p[2] * y;
-            parts->by_w[i][0][j] = p[3] * x, parts->by_w[i][1][j] = p[3] * y;
+            g->dense_plain[j] += p[3] * (x * x + y * y);
         }
     }
     add_products(4, MOMENTS / LANES, num, parts->p[0], 4, 1, parts->moment[0], MOMENTS, g->moments[0], MOMENTS);
@@ -115,13 +115,11 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
         add_products(SCALAR, DENSE / LANES, num, scalar, SCALAR, 1, parts->by_p[0][axis], 2 * DENSE, g->mixed[axis][0], DENSE);
     }
     for (int i = 0; i < DENSE; i += LANES) { /* at and right of the diagonal; both axes one behind the other */
-        int64_t vectors = (DENSE - i) / LANES;
-        add_products(LANES, vectors, 2 * num, dense + i, DENSE, 1, parts->by_p[0][0] + i, DENSE, g->dd[i] + i, DENSE);
-        add_products(LANES, vectors, 2 * num, dense + i, DENSE, 1, parts->by_w[0][0] + i, DENSE, g->dense_plain[i] + i, DENSE);
+        add_products(LANES, (DENSE - i) / LANES, 2 * num, dense + i, DENSE, 1, parts->by_p[0][0] + i, DENSE, g->dd[i] + i, DENSE);
     }
 }
 
-/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, and w E^T E of the scalars and of the dense fields. */
+/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, and w E^T E of the scalars, of the dense fields its diagonal. */
 static void spread_gram(const own_gram *g, double *gram, double *plain, double *dense_plain) {
     int power_x[SCALAR], power_y[SCALAR];
     for (int degree = 0, k = 0; degree <= 4; degree++) {
@@ -145,10 +143,8 @@ static void spread_gram(const own_gram *g, double *gram, double *plain, double *
         }
     }
     for (int i = 0; i < DENSE; i++) {
-        for (int j = 0; j < DENSE; j++) {
-            gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = i < j ? g->dd[i][j] : g->dd[j][i];
-            dense_plain[i * DENSE + j] = i < j ? g->dense_plain[i][j] : g->dense_plain[j][i];
-        }
+        for (int j = 0; j < DENSE; j++) gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = i < j ? g->dd[i][j] : g->dd[j][i];
+        dense_plain[i] = g->dense_plain[i];
     }
 }
 
@@ -249,7 +245,7 @@ static void subtract_pairs(
  * place (num_images): zeros, and zeros again afterwards.
  * Out: view (v), own (v), image (m), start (m + 1): see surroundings; num (2): m and rows of right.
  * absorbing (n_i, 3, 2).    right (rows, FIELDS): N^T E - W V^-1 J^T E without T, by image around: its design's columns,
- * then its included fields.    gram (FIELDS, FIELDS).    plain (SCALAR, SCALAR), dense_plain (DENSE, DENSE): E^T w E.
+ * then its included fields.    gram (FIELDS, FIELDS).    plain (SCALAR, SCALAR), dense_plain (DENSE): E^T w E, its diagonal.
  * score (FIELDS): E^T y~.    track_score (num_tracks, FIELDS): the same by track.
  * scores (max_scores): w rows^T y~ of all views, by image around: those of the design, then those of its included fields. */
 WIDE int64_t joint_first(

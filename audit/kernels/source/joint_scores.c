@@ -266,7 +266,7 @@ void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, in
  *
  * images (num); facts (num, 27), is_fisheye, power (num): as joint_fields has them.    most_rows, most_views, most_columns:
  * of these images, of the views of their points, and of design and included fields around.    widest: most columns of one image.
- * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12, 12): w E^T E; score (44); right,
+ * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12): w E^T E, its diagonal; score (44); right,
  * solution (width, 44): R and B at its own columns, zero where it has none. */
 WIDE KERNEL int64_t joint_scores(
     const joint_model *m, const base_inverse *s, const seen_points *p, int64_t num, const int64_t *images, const double *facts,
@@ -290,7 +290,7 @@ WIDE KERNEL int64_t joint_scores(
         num_tracks[k] = number_tracks(m, first, n, w.track);
         status[k] = joint_first(
             m, w.place, image, w.scalar, w.dense, w.track, num_tracks[k], w.most_columns, w.view, w.own, w.around, w.start, found,
-            w.absorbing, w.right, g, plain + k * SCALAR * SCALAR, dense_plain + k * DENSE * DENSE, score + k * FIELDS,
+            w.absorbing, w.right, g, plain + k * SCALAR * SCALAR, dense_plain + k * DENSE, score + k * FIELDS,
             w.track_score, w.scores, most_views * widest);
         if (status[k] != DONE) continue;
         int64_t count[2];
