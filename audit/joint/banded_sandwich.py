@@ -75,10 +75,10 @@ def _near(main: BandedInverse, meat: BandBlocks) -> tuple[FloatArray, list[Float
     for i in range(len(near) - 1, -1, -1):
         pivot, _ = lapack.dpotri(factor.diagonal[i], lower=1)
         pivot = np.tril(pivot) + np.tril(pivot, -1).T
-        y = pivot @ eliminated[i] @ pivot
+        y = pivot @ eliminated.pop() @ pivot  # what was used is given back
         if i + 1 < len(near):
-            u, size = multipliers[i], sizes[i + 1]
-            moved = main.near[i + 1][:, :size] @ (coupled[i] @ pivot)
+            u, size = multipliers.pop(), sizes[i + 1]
+            moved = main.near[i + 1][:, :size] @ (coupled.pop() @ pivot)
             after = near[i + 1][:, :size] @ u
             half = u.T @ (moved - 0.5 * after)
             y -= half + half.T

@@ -194,12 +194,13 @@ def joint_system(
     )
     gauge = gauge_directions(model, observations)
     reduced, plain = reduced_systems(observations)
+    point_inverse = reduced.point_inverse
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main.apply(reduced.right)
+    plain_step = _plain_step(plain, inverse, step, gauge)
+    del plain, reduced  # much memory
     nothing = np.zeros((0, 3))
-    base = with_step(Base(observations, reduced.point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
-    plain_step = _plain_step(plain, base, gauge)
-    del plain
+    base = with_step(Base(observations, point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
     return JointSystem(model, residuals, base, plain_step)
 
 
@@ -224,10 +225,12 @@ def with_step(base: Base, step: FloatArray) -> Base:
     return replace(base, step=step, point_step=moved, left_px=left)
 
 
-def _plain_step(plain: ReducedSystem, base: Base, gauge: FloatArray) -> FloatArray:
+def _plain_step(
+    plain: ReducedSystem, inverse: JointInverse, robust_step: FloatArray, gauge: FloatArray
+) -> FloatArray:
     """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
     if len(plain.right) <= _DIRECT:
         return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main.apply(plain.right))
-    front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=base.inverse.main.apply)
-    step, _ = sparse_linalg.cg(operator_of(plain.matrix), plain.right, x0=base.step, M=front, rtol=1e-8, maxiter=200)
+    front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=inverse.main.apply)
+    step, _ = sparse_linalg.cg(operator_of(plain.matrix), plain.right, x0=robust_step, M=front, rtol=1e-8, maxiter=200)
     return np.asarray(step)

@@ -47,6 +47,13 @@ static int by_number(const void *left, const void *right) {
     return (a > b) - (a < b);
 }
 
+/* Where the views of a point by images from `from` on begin; they are in the order of the images. */
+static inline int64_t view_from(const joint_model *m, int64_t point, int64_t from) {
+    int64_t k = m->point_offsets[point], end = m->point_offsets[point + 1];
+    while (k < end && m->image_of[k] < from) k++;
+    return k;
+}
+
 /* Collect the views of the points of rows first <= row < last of an image, those of images before `from` left out. A point
  * that the image shows twice has its views twice, once for each of the rows. place: (num_images) zeros, zeros again at the
  * end. */
@@ -56,9 +63,9 @@ static inline void collect(const joint_model *m, int64_t first, int64_t last, in
         int64_t point = m->point_idx[row];
         if (row + 2 * AHEAD < last) SOON(m->point_offsets + m->point_idx[row + 2 * AHEAD]);
         if (row + AHEAD < last) SOON(m->image_of + m->point_offsets[m->point_idx[row + AHEAD]]);
-        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
+        for (int64_t k = view_from(m, point, from); k < m->point_offsets[point + 1]; k++) {
             int64_t image = m->image_of[k];
-            if (image >= from && !place[image]++) out->image[count++] = image;
+            if (!place[image]++) out->image[count++] = image;
         }
     }
     qsort(out->image, (size_t)count, sizeof *out->image, by_number);
@@ -71,12 +78,9 @@ static inline void collect(const joint_model *m, int64_t first, int64_t last, in
     out->num_images = count, out->num_views = total;
     for (int64_t row = first; row < last; row++) {
         int64_t point = m->point_idx[row];
-        for (int64_t k = m->point_offsets[point]; k < m->point_offsets[point + 1]; k++) {
-            int64_t image = m->image_of[k];
-            if (image >= from) {
-                out->view[place[image]] = m->by_point[k];
-                out->own[place[image]++] = (int32_t)(row - first);
-            }
+        for (int64_t k = view_from(m, point, from); k < m->point_offsets[point + 1]; k++) {
+            int64_t at = place[m->image_of[k]]++;
+            out->view[at] = m->by_point[k], out->own[at] = (int32_t)(row - first);
         }
     }
     for (int64_t k = 0; k < count; k++) place[out->image[k]] = 0;
