@@ -225,9 +225,7 @@ def with_step(base: Base, step: FloatArray) -> Base:
     return replace(base, step=step, point_step=moved, left_px=left)
 
 
-def _plain_step(
-    plain: ReducedSystem, inverse: JointInverse, robust_step: FloatArray, gauge: FloatArray
-) -> FloatArray:
+def _plain_step(plain: ReducedSystem, inverse: JointInverse, robust_step: FloatArray, gauge: FloatArray) -> FloatArray:
     """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
     if len(plain.right) <= _DIRECT:
         return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main.apply(plain.right))

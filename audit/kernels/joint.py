@@ -103,28 +103,6 @@ class JointIndex:
         again = (point[1:] == point[:-1]) & (image[1:] == image[:-1])
         return bool(np.count_nonzero(again) == np.count_nonzero(~self.is_first))
 
-    @cached_property
-    def track_numbers(self) -> Int32Array:
-        """(n,) `tracks` of all images."""
-        offsets = self.offsets
-        if self.is_first.all():
-            starts = np.repeat(offsets[:-1].astype(np.int32), np.diff(offsets))
-            return np.arange(offsets[-1], dtype=np.int32) - starts
-        return np.concatenate([self.tracks(image)[0] for image in range(self.num_images)])
-
-    def tracks(self, image_idx: int) -> tuple[Int32Array, int]:
-        """Return (n_i,) which distinct point each row shows, -1 - t where an earlier row shows it too; their number."""
-        rows = slice(*self.offsets[image_idx : image_idx + 2].tolist())
-        is_first = self.is_first[rows]
-        if is_first.all():
-            return np.arange(is_first.size, dtype=np.int32), is_first.size
-        point = self.arrays["point_idx"][rows]
-        number = np.cumsum(is_first) - 1
-        firsts = np.flatnonzero(is_first)
-        order = firsts[np.argsort(point[firsts], kind="stable")]
-        track = number[order[np.searchsorted(point[order], point)]]
-        return np.where(is_first, track, -1 - track).astype(np.int32), firsts.size
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointArrays:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_audit.audit.kernels.checked import doubles, ints
 from sfm_audit.audit.kernels.joint import JointSums
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _PAIRS_AT_ONCE: Final = 4096
@@ -85,14 +85,13 @@ def normals(sums: JointSums, images: IntArray, transform: FloatArray, other: Oth
 
 def meats(sums: JointSums, images: IntArray, transform: FloatArray) -> PairBlocks | None:
     """Return scores times scores of some images, by track; None for the numpy path. transform: (I, C, C) T."""
-    pointers = Doubles, SmallInts, Size, Ints, Ints, Doubles
+    pointers = Doubles, Size, Ints, Ints, Doubles
     function = kernel("joint_meats", _MODEL, Size, Ints, *pointers)
     if function is None:
         return None
-    track = sums.index.track_numbers
 
     def some(first: int, room: _Room) -> int:
-        asked = len(images) - first, images[first:], transform, track, len(room.around)
+        asked = len(images) - first, images[first:], transform, len(room.around)
         return int(function(ctypes.byref(sums.model), *asked, room.counts[first:], room.around, room.slabs[0]))
 
     return _in_turn(sums, images, transform, 1, some)
