@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from sfm_audit.audit.joint.matrix import PairMatrix, Symmetric, csr_of, groups_of
 from sfm_audit.audit.kernels.joint_matrix import BandPlaces, band_of_blocks
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _MIN_BLOCKS: Final = 4  # fewer are no band
 _FAR_REACHING: Final = (8, 4, 2)  # times as many couplings as a column commonly has: it belongs to the border
@@ -106,14 +106,47 @@ def _starts(reach: IntArray, width: int) -> IntArray:
 
 
 class BandBlocks(NamedTuple):
-    """Entries of a matrix in the order of a band.
+    """Entries of a matrix in the order of a band; blocks are views of what lies in one piece.
 
     diagonal: (w_i, w_i) of each block.    below: (w_(i+1), w_i) of each but the last.    border: (D, m) last columns.
     """
 
+    flat: FloatArray
+    flat_below: FloatArray
     diagonal: list[FloatArray]
     below: list[FloatArray]
     border: FloatArray
+
+    @classmethod
+    def of(cls, band: Band, flat: FloatArray, flat_below: FloatArray, border: FloatArray) -> BandBlocks:
+        """Return them from what lies in one piece."""
+        widths = np.diff(band.starts).tolist()
+        below = in_blocks(flat_below, list(zip(widths[1:], widths[:-1], strict=True)))
+        return cls(flat, flat_below, in_blocks(flat, [(w, w) for w in widths]), below, border)
+
+    def at(self, band: Band, place: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Return entries (B, k, k) of a symmetric matrix at places (B, k), zero in the border.
+
+        The second answer says (B,) where some lie neither in a block nor in the one below it.
+        """
+        lower = np.minimum(place[:, :, None], place[:, None, :])
+        higher = np.maximum(place[:, :, None], place[:, None, :])
+        in_band = higher < band.num_banded
+        number, behind = (np.where(in_band, band.number(each), 0) for each in (lower, higher))
+        width = np.diff(band.starts)[number]
+        column, row = lower - band.starts[number], higher - band.starts[behind]
+        out = np.zeros(lower.shape)
+        for apart, flat, blocks in ((0, self.flat, self.diagonal), (1, self.flat_below, self.below)):
+            starts = np.cumsum([0, *(block.size for block in blocks)])
+            here = in_band & (behind == number + apart)
+            out[here] = flat.take(starts[number[here]] + row[here] * width[here] + column[here])
+        return out, np.asarray((in_band & (behind > number + 1)).any(axis=(1, 2)))
+
+
+def in_blocks(flat: FloatArray, shapes: list[tuple[int, int]]) -> list[FloatArray]:
+    """Return what lies in one piece as one block after the other."""
+    ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)]).tolist()
+    return [flat[a:b].reshape(shape) for (a, b), shape in zip(pairwise(ends), shapes, strict=True)]
 
 
 def band_blocks(matrix: Symmetric, band: Band, scale: FloatArray) -> BandBlocks:
@@ -121,10 +154,11 @@ def band_blocks(matrix: Symmetric, band: Band, scale: FloatArray) -> BandBlocks:
     if isinstance(matrix, PairMatrix):
         compiled = band_of_blocks(matrix.blocks, BandPlaces(band.place, band.starts), scale)
         if compiled is not None:
-            return BandBlocks(*compiled)
+            return BandBlocks.of(band, *compiled)
     scaled = sparse.diags_array(scale) @ csr_of(matrix) @ sparse.diags_array(scale)
     ordered = sparse.csr_array(sparse.csr_array(scaled)[band.order][:, band.order])
     blocks = list(band.blocks())
-    diagonal = [ordered[own, own].toarray() for own in blocks]
-    below = [ordered[following, own].toarray() for own, following in pairwise(blocks)]
-    return BandBlocks(diagonal, below, ordered[:, band.num_banded :].toarray())
+    diagonal = [ordered[own, own].toarray().ravel() for own in blocks]
+    below = [ordered[following, own].toarray().ravel() for own, following in pairwise(blocks)]
+    flat, flat_below = (np.concatenate([np.empty(0), *each]) for each in (diagonal, below))
+    return BandBlocks.of(band, flat, flat_below, ordered[:, band.num_banded :].toarray())

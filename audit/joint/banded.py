@@ -14,11 +14,11 @@ from typing import Final
 import numpy as np
 from scipy.linalg import blas, lapack, qr
 
-from sfm_audit.audit.joint.band import Band, band_blocks
+from sfm_audit.audit.joint.band import Band, band_blocks, in_blocks
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import near_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept: all that an image's neighbours span
 
@@ -89,7 +89,7 @@ def banded_factor(matrix: Symmetric, band: Band, null: FloatArray, inverse_scale
     -----
     F: the g rows at which the null directions differ most (pivoted QR of G^T); one for each, or X were no inverse of S.
     """
-    diagonal, coupled, columns = band_blocks(matrix, band, inverse_scale)
+    _, _, diagonal, coupled, columns = band_blocks(matrix, band, inverse_scale)
     free = null[band.order]
     added = (inverse_scale == 0)[band.order].astype(np.float64)
     if free.shape[1]:
@@ -178,13 +178,21 @@ class BandedInverse:
 
     def blocks(self, columns: IntArray) -> FloatArray:
         """(B, k, k) entries of S^+ at columns (B, k)."""
-        place = self.factor.band.place[columns]
-        out, too_far = entries_at(self.factor.band, self.flat, self.near, place)
+        place, band = self.factor.band.place[columns], self.factor.band
+        lower = np.minimum(place[:, :, None], place[:, None, :])
+        higher = np.maximum(place[:, :, None], place[:, None, :])
+        starts, sizes = _places_in_flat(self.near)
+        in_band = higher < band.num_banded
+        number = np.where(in_band, band.number(lower), 0)
+        origin = band.starts[number]
+        too_far = in_band & (higher - origin >= sizes[number])
+        at = starts[number] + (lower - origin) * sizes[number] + higher - origin
+        out = np.where(in_band, self.flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
         outer = self.aside[place] @ self.pull[place].swapaxes(1, 2)
         out -= outer + outer.swapaxes(1, 2)
         scale = self.inverse_scale[columns]
         out *= scale[:, None, :] * scale[:, :, None]
-        for k in np.flatnonzero(too_far).tolist():
+        for k in np.flatnonzero(too_far.any(axis=(1, 2))).tolist():
             out[k] = self.block(columns[k])
         return np.asarray(out)
 
@@ -229,31 +237,6 @@ def _places_in_flat(near: list[FloatArray]) -> tuple[IntArray, IntArray]:
     return np.concatenate([[0], np.cumsum(sizes)]), np.array([block.shape[1] for block in near], dtype=np.int64)
 
 
-def entries_at(band: Band, flat: FloatArray, near: list[FloatArray], place: IntArray) -> tuple[FloatArray, BoolArray]:
-    """Return entries (B, k, k) at places (B, k) of what ``near`` has of a symmetric matrix, zero in the border.
-
-    near: per block its rows at the columns from its first one on; views of ``flat``, where one follows the other.
-    The second answer says (B,) where not all entries are at hand.
-    """
-    lower = np.minimum(place[:, :, None], place[:, None, :])
-    higher = np.maximum(place[:, :, None], place[:, None, :])
-    starts, sizes = _places_in_flat(near)
-    in_band = higher < band.num_banded
-    number = np.where(in_band, band.number(lower), 0)
-    origin = band.starts[number]
-    too_far = in_band & (higher - origin >= sizes[number])
-    at = starts[number] + (lower - origin) * sizes[number] + higher - origin
-    out = np.where(in_band, flat.take(np.where(in_band & ~too_far, at, 0)), 0.0)
-    return np.asarray(out), np.asarray(too_far.any(axis=(1, 2)))
-
-
-def near_room(shapes: list[tuple[int, int]]) -> tuple[FloatArray, list[FloatArray]]:
-    """Return room for one block after the other, in one piece and as blocks."""
-    ends = np.cumsum([rows * columns for rows, columns in shapes])
-    flat = np.empty(int(ends[-1]))
-    return flat, [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
-
-
 def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInverse:
     """Return S^+ in the units of the matrix.
 
@@ -267,7 +250,8 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     shapes = [
         (own.stop - own.start, end - own.start) for own, end in zip(factor.band.blocks(), ends_of_reach, strict=False)
     ]
-    flat, near = near_room(shapes)
+    flat = np.empty(sum(rows * columns for rows, columns in shapes))
+    near = in_blocks(flat, shapes)
     for i in range(len(factor.diagonal) - 1, -1, -1):
         own, _ = lapack.dpotri(factor.diagonal[i], lower=1)
         own = np.tril(own) + np.tril(own, -1).T

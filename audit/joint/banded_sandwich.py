@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from sfm_audit.audit.joint.band import BandBlocks, band_blocks
-from sfm_audit.audit.joint.banded import BandedFactor, BandedInverse, entries_at, near_room
+from sfm_audit.audit.joint.banded import BandedFactor, BandedInverse
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -32,7 +32,7 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
         """The meat in scaled units times (D, c), by place."""
         return ((meat @ (values[band.place] * scale[:, None])) * scale[:, None])[band.order]
 
-    flat, near = _near(main, band_blocks(meat, band, scale))
+    near = _near(main, band_blocks(meat, band, scale))
     pulled = factor.solve_in_order(times(factor.solve_in_order(null)))
     pull = pulled - 0.5 * null @ (null.T @ pulled)  # P Y P = Y - G H^T - H G^T
     aside, pull = main.aside, np.hstack([pull, -_of_border(factor, times)])
@@ -41,7 +41,7 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
         numbers = [k for k, block in enumerate(blocks) if block.size == size]
         columns = np.stack([blocks[k] for k in numbers])
         place = band.place[columns]
-        values, too_far = entries_at(band, flat, near, place)
+        values, too_far = near.at(band, place)
         outer = aside[place] @ pull[place].swapaxes(1, 2)
         values -= outer + outer.swapaxes(1, 2)
         values *= scale[columns][:, None, :] * scale[columns][:, :, None]
@@ -60,28 +60,25 @@ def _of_border(factor: BandedFactor, times: Callable[[FloatArray], FloatArray]) 
     return np.asarray(factor.solve_in_order(weighed) @ corner - 0.5 * beside @ inner)
 
 
-def _near(main: BandedInverse, meat: BandBlocks) -> tuple[FloatArray, list[FloatArray]]:
-    """Per block i, [Y_(i, i), Y_(i, i+1)], in one piece and as blocks; the meat's memory is used up."""
-    factor, eliminated, coupled, multipliers = main.factor, meat.diagonal, meat.below, []
-    for i, across in enumerate(coupled):
+def _near(main: BandedInverse, meat: BandBlocks) -> BandBlocks:
+    """Y_(i, i) and Y_(i+1, i) of each block i, in the memory of the meat; its border stays."""
+    factor, diagonal, below, multipliers = main.factor, meat.diagonal, meat.below, []
+    for i, across in enumerate(below):
         u = np.asarray(blas.dtrsm(1.0, factor.diagonal[i], factor.below[i], side=1, lower=1))
-        moved = u @ eliminated[i]
+        moved = u @ diagonal[i]
         half = u @ (across - 0.5 * moved).T
-        eliminated[i + 1] -= half + half.T
-        coupled[i] = across - moved
+        diagonal[i + 1] -= half + half.T
+        below[i] -= moved
         multipliers.append(u)
-    sizes = [len(block) for block in eliminated]
-    flat, near = near_room([(own, own + behind) for own, behind in zip(sizes, [*sizes[1:], 0], strict=True)])
-    for i in range(len(near) - 1, -1, -1):
+    for i in range(len(diagonal) - 1, -1, -1):
         pivot, _ = lapack.dpotri(factor.diagonal[i], lower=1)
         pivot = np.tril(pivot) + np.tril(pivot, -1).T
-        y = pivot @ eliminated.pop() @ pivot  # what was used is given back
-        if i + 1 < len(near):
-            u, size = multipliers.pop(), sizes[i + 1]
-            moved = main.near[i + 1][:, :size] @ (coupled.pop() @ pivot)
-            after = near[i + 1][:, :size] @ u
+        diagonal[i][...] = pivot @ diagonal[i] @ pivot
+        if i < len(below):
+            u = multipliers.pop()  # what was used is given back
+            moved = main.near[i + 1][:, : len(u)] @ (below[i] @ pivot)
+            after = diagonal[i + 1] @ u
             half = u.T @ (moved - 0.5 * after)
-            y -= half + half.T
-            near[i][:, sizes[i] :] = (moved - after).T
-        near[i][:, : sizes[i]] = y
-    return flat, near
+            diagonal[i] -= half + half.T
+            np.subtract(moved, after, out=below[i])
+    return meat

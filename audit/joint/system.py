@@ -194,11 +194,11 @@ def joint_system(
     )
     gauge = gauge_directions(model, observations)
     reduced, plain = reduced_systems(observations)
-    point_inverse = reduced.point_inverse
+    point_inverse, plain = reduced.point_inverse, replace(plain, point_inverse=plain.point_inverse[:0])  # much memory
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main.apply(reduced.right)
     plain_step = _plain_step(plain, inverse, step, gauge)
-    del plain, reduced  # much memory
+    del plain, reduced
     nothing = np.zeros((0, 3))
     base = with_step(Base(observations, point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
     return JointSystem(model, residuals, base, plain_step)

@@ -67,12 +67,13 @@ class BandPlaces(NamedTuple):
 
 def band_of_blocks(
     given: Blocks, order: BandPlaces, scale: FloatArray
-) -> tuple[list[FloatArray], list[FloatArray], FloatArray] | None:
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """E (A + A^T) E by place, E diagonal, ``scale`` (D,): blocks on the diagonal, blocks below them, border (D, m).
 
+    Blocks follow each other in one piece, (w_i, w_i) and (w_(i+1), w_i).
     None for the numpy path, and where the matrix is no such band.
     """
-    function = kernel("joint_band", *_BLOCKS, Ints, Ints, Ints, Size, Ints, Ints, *([Doubles] * 3))
+    function = kernel("joint_band", *_BLOCKS, Ints, Ints, Ints, Size, Ints, Ints, *([Doubles] * 4))
     size, num_blocks = given.size, len(order.starts) - 1
     place, starts = ints(order.place, size), ints(order.starts, num_blocks + 1)
     widths, num_banded = np.diff(starts), int(starts[-1])
@@ -82,17 +83,10 @@ def band_of_blocks(
         raise ValueError("places of another matrix")
     if function is None:
         return None
-    heights = np.append(widths[1:], 0)
-    sizes = np.concatenate([widths * widths, widths * heights])
-    ends = np.cumsum(sizes)
-    at, at_below = np.split(ends - sizes, 2)
-    near, border = np.zeros(int(sizes.sum())), np.zeros((size, size - num_banded))
+    sizes, below_sizes = widths * widths, np.append(widths[1:], 0) * widths
+    places = np.cumsum(sizes) - sizes, np.cumsum(below_sizes) - below_sizes
+    diagonal, below, border = np.zeros(sizes.sum()), np.zeros(below_sizes.sum()), np.zeros((size, size - num_banded))
     number = np.repeat(np.arange(num_blocks), widths)
-    of_band = place, number, starts, num_blocks, at, at_below, doubles(scale, (size,))
-    if function(size, *given.blocks.shape, *given[1:], *of_band, near, border) != _DONE:
-        return None
-    parts = np.split(near, ends[:-1])
-    diagonal = [part.reshape(w, w) for part, w in zip(parts[:num_blocks], widths, strict=True)]
-    shapes = zip(heights[:-1].tolist(), widths[:-1].tolist(), strict=True)
-    below = [part.reshape(shape) for part, shape in zip(parts[num_blocks:-1], shapes, strict=True)]
-    return diagonal, below, border
+    of_band = place, number, starts, num_blocks, *places, doubles(scale, (size,))
+    status = function(size, *given.blocks.shape, *given[1:], *of_band, diagonal, below, border)
+    return (diagonal, below, border) if status == _DONE else None

@@ -87,7 +87,7 @@ KERNEL int64_t joint_times(
 typedef struct {
     int64_t num_banded, num_border;
     const int64_t *number, *starts, *at, *at_below;
-    double *near, *border;
+    double *diagonal, *below, *border;
 } band_places;
 
 /* Add to the entry at places p (row) and q, if it is one of those that are kept; 0 where it lies outside of the band. */
@@ -99,21 +99,22 @@ INLINE int add_entry(const band_places *to, int64_t p, int64_t q, double value) 
     if (p >= to->num_banded) return 1;
     int64_t here = to->number[q], apart = to->number[p] - here, first = to->starts[here];
     int64_t columns = to->starts[here + 1] - first;
-    if (apart == 0) to->near[to->at[here] + (p - first) * columns + q - first] += value;
-    else if (apart == 1) to->near[to->at_below[here] + (p - to->starts[here + 1]) * columns + q - first] += value;
+    if (apart == 0) to->diagonal[to->at[here] + (p - first) * columns + q - first] += value;
+    else if (apart == 1) to->below[to->at_below[here] + (p - to->starts[here + 1]) * columns + q - first] += value;
     return apart >= -1 && apart <= 1;
 }
 
 /* E (A + A^T) E, E a diagonal matrix, in the order of a band (audit/joint/band.py).
  *
  * place (size): of each column; number (num_banded): which block has each place; starts (num_blocks + 1); scale (size): E.
- * at, at_below (num_blocks): where in `near` the entries of each block begin, and those of the block below it; near and border
- * (size, num_border): zeros.    Returns NEEDS_NUMPY where an entry lies outside of the band. */
+ * at, at_below (num_blocks): where in `diagonal` the entries of each block begin, and in `below` those of the block below it; all
+ * are zeros before, and border (size, num_border).    Returns NEEDS_NUMPY where an entry lies outside of the band. */
 KERNEL int64_t joint_band(
     int64_t size, int64_t num, int64_t height, int64_t width, const int64_t *rows, const int64_t *columns, const double *blocks,
     const int64_t *place, const int64_t *number, const int64_t *starts, int64_t num_blocks, const int64_t *at,
-    const int64_t *at_below, const double *scale, double *near, double *border) {
-    const band_places to = {starts[num_blocks], size - starts[num_blocks], number, starts, at, at_below, near, border};
+    const int64_t *at_below, const double *scale, double *diagonal, double *below, double *border) {
+    const band_places to = {starts[num_blocks], size - starts[num_blocks], number, starts, at, at_below, diagonal, below,
+                            border};
     for (int64_t k = 0; k < num * height; k++) {
         const int64_t *where = columns + k / height * width, r = rows[k];
         for (int64_t b = 0; r < size && b < width; b++) {
