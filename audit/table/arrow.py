@@ -49,6 +49,10 @@ class Structs:
 
 
 _FLOATS: Final = frozenset({float, np.float64, type(None)})
+_DOUBLE: Final = pa.float64()
+_FEW_ROWS: Final = 1 << 11  # 4 MB of the images table: columns of more rows are not copied
+_MANY_SCHEMAS: Final = 64
+_known_kinds: Final[dict[int, tuple[pa.Schema, list[tuple[str, pa.DataType]]]]] = {}
 Values = npt.NDArray[Any] | Sequence[Any]
 Column = Values | Coded | Listed | Structs
 
@@ -83,15 +87,50 @@ def build_table(columns: Mapping[str, Column], wanted: pa.Schema) -> pa.Table:
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns differ in length: {lengths}")
-    arrays = [_build_column(columns[field.name], field) for field in wanted]
-    return pa.Table.from_arrays(arrays, schema=wanted)
+    kinds = _kinds(wanted)
+    arrays = _float_arrays(columns, kinds) if next(iter(lengths.values()), 0) <= _FEW_ROWS else {}
+    every = [arrays[name] if name in arrays else _build_column(columns[name], name, kind) for name, kind in kinds]
+    return pa.Table.from_arrays(every, schema=wanted)
 
 
-def _build_column(values: Column, field: pa.Field[Any]) -> pa.Array[Any]:
+def _kinds(wanted: pa.Schema) -> list[tuple[str, pa.DataType]]:
+    """Return names and types of a schema; asked once of each, as schemas are made once."""
+    known = _known_kinds.get(id(wanted))
+    if known is None or known[0] is not wanted:
+        if len(_known_kinds) >= _MANY_SCHEMAS:
+            _known_kinds.clear()
+        known = _known_kinds[id(wanted)] = wanted, [(field.name, field.type) for field in wanted]
+    return known[1]
+
+
+def _float_arrays(columns: Mapping[str, Column], kinds: Sequence[tuple[str, pa.DataType]]) -> dict[str, pa.Array[Any]]:
+    """Return the columns of doubles, without a mask, as pieces of one buffer: few rows are made in one go."""
+    of_doubles = [(name, columns[name]) for name, kind in kinds if kind == _DOUBLE]
+    found = {
+        name: values
+        for name, values in of_doubles
+        if (type(values) is np.ndarray and values.dtype == np.float64 and values.ndim == 1)
+        or (type(values) is list and _FLOATS.issuperset(map(type, values)))
+    }
+    if not found:
+        return {}
+    rows = np.array(list(found.values()), dtype=np.float64)  # None becomes NaN, which is null
+    known = np.isfinite(rows)  # a table never holds an infinity
+    packed = np.packbits(known, axis=1, bitorder="little")
+    is_whole: npt.NDArray[np.bool_] = np.asarray(known.all(axis=1))
+    bits, data, (width, size, num) = _buffer(packed), _buffer(rows), (packed.shape[1], rows[0].nbytes, rows.shape[1])
+    out = {}
+    for row, name in enumerate(found):
+        valid = None if is_whole[row] else bits.slice(row * width, width)
+        out[name] = pa.Array.from_buffers(_DOUBLE, num, [valid, data.slice(row * size, size)])
+    return out
+
+
+def _build_column(values: Column, name: str, kind: pa.DataType) -> pa.Array[Any]:
     try:
-        return _build_array(values, field.type)
+        return _build_array(values, kind)
     except (TypeError, ValueError) as error:
-        raise type(error)(f"column {field.name}: {error}") from error
+        raise type(error)(f"column {name}: {error}") from error
 
 
 def _build_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
@@ -202,9 +241,11 @@ def _struct_array(values: Column, kind: pa.DataType) -> pa.Array[Any]:
         raise TypeError(f"expected {kind}, found {type(values).__name__}")
     fields = [kind.field(i) for i in range(kind.num_fields)]
     if isinstance(values, Structs):
-        children = [_build_column(values.fields[field.name], field) for field in fields]
+        children = [_build_column(values.fields[field.name], field.name, field.type) for field in fields]
     else:
-        children = [_build_column([getattr(item, field.name) for item in values], field) for field in fields]
+        children = [
+            _build_column([getattr(item, field.name) for item in values], field.name, field.type) for field in fields
+        ]
     return pa.Array.from_buffers(kind, len(values), [None], children=children)
 
 

@@ -1,3 +1,4 @@
+import pickle
 import subprocess
 import sys
 from typing import Any
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_samples import sample_table
 
-from sfm_audit.audit.table import CAMERAS, IMAGES, MODELS, OBSERVATIONS, TABLES, build_table, empty_table, schema
+from sfm_audit.audit.table import CAMERAS, IMAGES, MODELS, OBSERVATIONS, TABLES, arrow, build_table, empty_table, schema
 from sfm_audit.loaders.model import Finding, FindingCode
 
 GROUPS = ("radial", "tangential", "affine", "principal_point", "rolling_shutter", "smooth")
@@ -235,3 +236,36 @@ def test_building_writing_and_reading_parts_does_not_import_pandas():
     paths = [path for path in sys.path if path.endswith("tests")]
     done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("num", [0, 1, 7, 8, 9, 20])
+def test_columns_of_few_rows_are_those_that_are_made_one_by_one(num, monkeypatch):
+    rng = np.random.default_rng(num)
+    odd = rng.normal(size=num)
+    odd[::3], odd[1::4] = np.nan, -np.inf
+    columns = {
+        "plain": rng.normal(size=num),
+        "odd": odd,
+        "listed": [None if k % 2 else float(k) for k in range(num)],
+        "scalars": list(odd),
+        "masked": np.ma.masked_array(odd, rng.random(num) < 0.5),
+        "strided": np.repeat(odd, 2)[::2],
+        "counted": rng.integers(0, 9, num),
+        "whole": [1, *[None] * (num - 1)][:num],
+    }
+    wanted = pa.schema([(name, pa.int64() if name == "counted" else pa.float64()) for name in columns])
+    found = arrow.build_table(columns, wanted)
+    found.validate(full=True)
+    monkeypatch.setattr(arrow, "_FEW_ROWS", -1)
+    expected = arrow.build_table(columns, wanted)
+    assert found.equals(expected)
+    assert [column.null_count for column in found.columns] == [column.null_count for column in expected.columns]
+    assert pickle.loads(pickle.dumps(found)).equals(expected)  # noqa: S301 - as worker processes send them
+
+
+def test_a_schema_that_lies_where_another_one_did_is_not_taken_for_it():
+    for k in range(200):
+        wanted = pa.schema([(f"column{k}", pa.int64() if k % 2 else pa.float64())])
+        assert arrow.build_table({f"column{k}": [1]}, wanted).schema.equals(wanted)
+        del wanted
+    assert len(arrow._known_kinds) <= arrow._MANY_SCHEMAS
