@@ -284,36 +284,41 @@ WIDE KERNEL int64_t joint_normals(
     return done;
 }
 
+/* out (padded): w design^T y~ of a view, zeros behind the last column. */
+INLINE void weigh_view(const joint_model *m, int64_t view, int64_t padded, double *out) {
+    int64_t width = m->width;
+    const double *dx = m->design + view * 2 * width, *dy = dx + width;
+    double w = m->weight[view], x = w * m->left[2 * view], y = w * m->left[2 * view + 1];
+    if (width == padded) {
+        for (int64_t c = 0; c < padded; c += LANES) STORE(out + c) = x * LOAD(dx + c) + y * LOAD(dy + c);
+    } else {
+        for (int64_t c = 0; c < padded; c++) out[c] = c < width ? dx[c] * x + dy[c] * y : 0.0;
+    }
+}
+
 /* joint_meats of one image. */
 INLINE int64_t meat_of(
     const joint_model *m, int64_t image, int64_t padded, around *space, const double *transform, int64_t room, int64_t *found,
     double *slab) {
     int64_t last = m->offsets[image + 1], width = m->width, square = width * width;
-    double turn[SQUARE];
+    double turn[SQUARE], value[MOST_COLUMNS];
     pad_square(transform + image * square, width, padded, turn);
     for (int64_t row = m->offsets[image]; row < last; row++) {
         int64_t point = m->point_idx[row], begin = view_from(m, point, image), end = m->point_offsets[point + 1];
         wide score[WIDES] = {{0}};
         ask_ahead(m, row, last, image, NULL);
         if (begin == end || m->by_point[begin] != row) continue; /* the image's first view of the point has spoken for all */
-        for (int64_t k = begin; k < end; k++) {
-            int64_t view = m->by_point[k];
-            const double *dx = m->design + view * 2 * width, *dy = dx + width;
-            double w = m->weight[view], x = w * m->left[2 * view], y = w * m->left[2 * view + 1];
-            if (m->image_of[k] != image) break;
+        for (int64_t k = begin; k < end && m->image_of[k] == image; k++) {
+            weigh_view(m, m->by_point[k], padded, value);
             for (int64_t c = 0; c < width; c++) {
-                double value = dx[c] * x + dy[c] * y;
-                for (int64_t d = 0; d < padded / LANES; d++) score[d] += value * LOAD(turn + c * padded + LANES * d);
+                for (int64_t d = 0; d < padded / LANES; d++) score[d] += value[c] * LOAD(turn + c * padded + LANES * d);
             }
         }
         for (int64_t k = begin; k < end; k++) {
-            int64_t view = m->by_point[k];
-            const double *dx = m->design + view * 2 * width, *dy = dx + width;
-            double w = m->weight[view], x = w * m->left[2 * view], y = w * m->left[2 * view + 1];
             double *here = sums_with(space, m->image_of[k]);
+            weigh_view(m, m->by_point[k], padded, value);
             for (int64_t c = 0; c < width; c++) {
-                double value = dx[c] * x + dy[c] * y;
-                for (int64_t d = 0; d < padded / LANES; d++) STORE(here + c * padded + LANES * d) += value * score[d];
+                for (int64_t d = 0; d < padded / LANES; d++) STORE(here + c * padded + LANES * d) += value[c] * score[d];
             }
         }
     }
