@@ -162,3 +162,13 @@ def band_blocks(matrix: Symmetric, band: Band, scale: FloatArray) -> BandBlocks:
     below = [ordered[following, own].toarray().ravel() for own, following in pairwise(blocks)]
     flat, flat_below = (np.concatenate([np.empty(0), *each]) for each in (diagonal, below))
     return BandBlocks.of(band, flat, flat_below, ordered[:, band.num_banded :].toarray())
+
+
+def dense_of(matrix: Symmetric, scale: FloatArray) -> FloatArray:
+    """Return E matrix E (D, D), E diagonal, ``scale`` (D,)."""
+    if isinstance(matrix, PairMatrix):
+        everything = np.arange(scale.size)
+        compiled = band_of_blocks(matrix.blocks, BandPlaces(everything, np.array([0, scale.size])), scale)
+        if compiled is not None:
+            return compiled[0].reshape(scale.size, scale.size)
+    return np.asarray((sparse.diags_array(scale) @ csr_of(matrix) @ sparse.diags_array(scale)).toarray())

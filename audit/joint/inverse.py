@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
-from scipy import sparse
 from scipy.linalg import lapack
 
-from sfm_audit.audit.joint.band import Band, band_of
+from sfm_audit.audit.joint.band import Band, band_of, dense_of
 from sfm_audit.audit.joint.banded import BandedFactor, banded_factor, banded_inverse
-from sfm_audit.audit.joint.matrix import Symmetric, csr_of
+from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import dense_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -188,6 +187,31 @@ def joint_inverse(matrix: Symmetric, before: FloatArray, gauge: FloatArray) -> J
     if not size:
         empty = np.zeros((0, 0))
         return JointInverse(DenseInverse(empty), nothing, nothing, empty, np.zeros(0, dtype=bool), 0, nothing)
+    factor, inverse_scale, free, further = _deflated_factor(matrix, before, gauge)
+    lost = (inverse_scale == 0) | ((further**2).sum(axis=1) > _IN_NULL)
+    main: SymmetricInverse
+    if isinstance(factor, BandedFactor):
+        main = banded_inverse(factor, inverse_scale)
+    else:
+        main = _dense_inverse(factor, np.hstack([free, further]), inverse_scale)
+    unscaled = free * inverse_scale[:, None]
+    return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1], unscaled)
+
+
+def joint_solution(matrix: Symmetric, before: FloatArray, gauge: FloatArray, right: FloatArray) -> FloatArray:
+    """Return S^+ right (D,) as `joint_inverse` would have it, without the inverse."""
+    if not len(right):
+        return right
+    factor, inverse_scale, _, further = _deflated_factor(matrix, before, gauge)
+    step = factor.solve((right * inverse_scale)[:, None])[:, 0]
+    step -= further @ (further.T @ step)  # the last ones that were found are not in the factor where there are too many
+    return np.asarray(step * inverse_scale)
+
+
+def _deflated_factor(
+    matrix: Symmetric, before: FloatArray, gauge: FloatArray
+) -> tuple[BandedFactor | _DenseFactor, FloatArray, FloatArray, FloatArray]:
+    """Factor in units of unit diagonal; (D,) 1 / unit, 0 of dead columns; directions of the gauge, and others found."""
     diagonal = matrix.diagonal()
     dead = diagonal <= _DEAD * before
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
@@ -205,14 +229,7 @@ def joint_inverse(matrix: Symmetric, before: FloatArray, gauge: FloatArray) -> J
         deflated = np.hstack([deflated, found])
         if further.shape[1] >= _MAX_NULL:
             break
-    lost = dead | ((further**2).sum(axis=1) > _IN_NULL)
-    main: SymmetricInverse
-    if isinstance(factor, BandedFactor):
-        main = banded_inverse(factor, inverse_scale)
-    else:
-        main = _dense_inverse(factor, deflated, inverse_scale)
-    unscaled = free * inverse_scale[:, None]
-    return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1], unscaled)
+    return factor, inverse_scale, free, further
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,19 +246,13 @@ class _DenseFactor:
         return np.asarray(out - self.deflated @ (self.deflated.T @ out))
 
 
-def _scaled(matrix: sparse.csr_array, inverse_scale: FloatArray) -> sparse.csr_array:
-    """S with unit diagonal; of dead columns nothing but that."""
-    scaled = sparse.diags_array(inverse_scale) @ matrix @ sparse.diags_array(inverse_scale)
-    dead = inverse_scale == 0
-    return sparse.csr_array(scaled + sparse.diags_array(dead.astype(np.float64)) if dead.any() else scaled)
-
-
-def _dense(scaled: sparse.csr_array, deflated: FloatArray) -> FloatArray:
-    """S plus Z Z^T, in Fortran order, for LAPACK."""
-    out = scaled.toarray().T  # symmetric: the transpose is in Fortran order
+def _dense(matrix: Symmetric, inverse_scale: FloatArray, deflated: FloatArray) -> FloatArray:
+    """S with unit diagonal, of dead columns nothing but that, plus Z Z^T; in Fortran order, for LAPACK."""
+    out = dense_of(matrix, inverse_scale).T  # symmetric: the transpose is in Fortran order
+    np.einsum("ii->i", out)[...] += inverse_scale == 0
     if deflated.shape[1]:
         _add_outer(out, deflated, 1.0)
-    return np.asarray(out)
+    return out
 
 
 def _add_outer(out: FloatArray, columns: FloatArray, sign: float) -> None:
@@ -255,13 +266,13 @@ def _factor(
     matrix: Symmetric, inverse_scale: FloatArray, deflated: FloatArray, band: Band | None
 ) -> BandedFactor | _DenseFactor:
     banded = banded_factor(matrix, band, deflated, inverse_scale) if band else None
-    return banded or _dense_factor(_scaled(csr_of(matrix), inverse_scale), deflated)
+    return banded or _dense_factor(matrix, inverse_scale, deflated)
 
 
-def _dense_factor(scaled: sparse.csr_array, deflated: FloatArray) -> _DenseFactor:
+def _dense_factor(matrix: Symmetric, inverse_scale: FloatArray, deflated: FloatArray) -> _DenseFactor:
     shift = 0.0
     while True:
-        array = _dense(scaled, deflated)
+        array = _dense(matrix, inverse_scale, deflated)
         if shift:
             array[np.diag_indices(len(array))] += shift
         factor, info = lapack.dpotrf(array, lower=1, overwrite_a=1, clean=0)

@@ -14,7 +14,7 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.banded import BandedInverse
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
-from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_inverse
+from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_inverse, joint_solution
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.matrix import Symmetric, operator_of
 from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
@@ -228,7 +228,7 @@ def with_step(base: Base, step: FloatArray) -> Base:
 def _plain_step(plain: ReducedSystem, inverse: JointInverse, robust_step: FloatArray, gauge: FloatArray) -> FloatArray:
     """The step with w = 1: directly for small systems, by conjugate gradients with S^+ in front for large ones."""
     if len(plain.right) <= _DIRECT:
-        return np.asarray(joint_inverse(plain.matrix, plain.before, gauge).main.apply(plain.right))
+        return joint_solution(plain.matrix, plain.before, gauge, plain.right)
     front = sparse_linalg.LinearOperator(plain.matrix.shape, matvec=inverse.main.apply)
     step, _ = sparse_linalg.cg(operator_of(plain.matrix), plain.right, x0=robust_step, M=front, rtol=1e-8, maxiter=200)
     return np.asarray(step)

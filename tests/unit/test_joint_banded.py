@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose
 from scipy import sparse
 
 from sfm_audit.audit.joint import inverse as joint_inverses
-from sfm_audit.audit.joint.band import _starts, band_blocks, band_of
+from sfm_audit.audit.joint.band import _starts, band_blocks, band_of, dense_of
 from sfm_audit.audit.joint.banded import BandedInverse, banded_factor
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
-from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse
+from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse, joint_solution
 from sfm_audit.audit.joint.matrix import csr_of
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 from sfm_audit.audit.joint.own import _walds, walds
@@ -107,6 +107,13 @@ def test_it_is_the_dense_inverse(street, scale, dense):
     assert_allclose(found.main.block(everything) * both, expected, atol=1e-9 * np.abs(expected).max())
     assert found.num_null == dense.num_null == 0
     assert (found.unidentified == dense.unidentified).all()
+
+
+def test_a_solution_needs_no_inverse(street, reduced):
+    gauge = gauge_directions(street.model, street.observations)
+    found = joint_solution(reduced.matrix, reduced.before, gauge, reduced.right)
+    assert_allclose(found, street.base.inverse.main.apply(reduced.right), rtol=1e-9, atol=1e-12 * np.abs(found).max())
+    assert joint_solution(reduced.matrix, reduced.before[:0], gauge[:0], reduced.right[:0]).shape == (0,)
 
 
 def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
@@ -233,6 +240,7 @@ def test_the_blocks_of_a_band_are_the_matrix_in_its_order(reduced, scale):
         for (own, following), block in zip(pairwise(parts), found.below, strict=True):
             assert_allclose(block, expected[following, own], atol=1e-14)
         assert_allclose(found.border, expected[:, band.num_banded :], atol=1e-14)
+        assert_allclose(dense_of(matrix, unit)[np.ix_(band.order, band.order)], expected, atol=1e-14)
 
 
 def test_columns_in_groups_make_a_band_as_columns_alone_do(reduced):

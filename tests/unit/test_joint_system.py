@@ -26,7 +26,7 @@ from sfm_audit.audit.joint.candidates import FieldsInParts, ImageFields, candida
 from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.group_test import test_group as judge_group
 from sfm_audit.audit.joint.inclusion import Candidate, include
-from sfm_audit.audit.joint.inverse import joint_inverse
+from sfm_audit.audit.joint.inverse import joint_inverse, joint_solution
 from sfm_audit.audit.joint.normal import reduced_systems
 from sfm_audit.audit.joint.worth import worth_of
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, candidate_fields
@@ -290,6 +290,9 @@ def test_a_further_null_direction_is_found_and_said(system):
     scale = np.sqrt(matrix.diagonal())[others]
     expected = system.base.inverse.main.block(others) * scale * scale[:, None]
     assert_allclose(inverse.main.block(others) * scale * scale[:, None], expected, atol=1e-6 * expected.max())
+    right = reduced.right[index]
+    step = joint_solution(doubled, reduced.before[index], gauge, right)
+    assert_allclose(step, inverse.main.apply(right), atol=1e-9 * np.abs(step).max())
 
 
 def test_points_that_are_independent_leave_nothing_to_eliminate():
