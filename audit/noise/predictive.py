@@ -97,10 +97,7 @@ class StudentToNormal:
         self.nu_values = nu_values
         self.log_front = _log_front(nu_values)
         nodes: FloatArray = np.arange(_NUM_CELLS + 2, dtype=np.float64) * _STEP
-        ratio = np.empty((len(nu_values), nodes.size))
-        slope = np.empty_like(ratio)
-        for row, nu in enumerate(nu_values):
-            ratio[row], slope[row] = _ratio_and_slope(float(nu), nodes)
+        ratio, slope = _ratio_and_slope(nu_values, nodes)
         left, right = ratio[:, :-1], ratio[:, 1:]
         left_slope, right_slope = slope[:, :-1] * _STEP, slope[:, 1:] * _STEP
         rise = right - left
@@ -146,17 +143,18 @@ def _log_front(nu: FloatArray) -> FloatArray:
     return np.asarray(special.gammaln(0.5 * (nu + 1.0)) - special.gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu))
 
 
-def _ratio_and_slope(nu: float, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Ratio z / w and its derivative at nodes w >= 0, w[0] = 0."""
-    inner = w[1:]
+def _ratio_and_slope(nu_values: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ratio z / w and its derivative, (v, k) each, at nodes w (k,) >= 0, w[0] = 0."""
+    inner, nu, size = w[1:], nu_values[:, None], (len(nu_values), len(w) - 1)
     t = np.sqrt(nu * np.expm1(inner**2 / nu))
-    z = student_to_normal(t, np.full_like(t, nu))
-    log_ratio_at_zero = float(_log_front(np.array([nu]))[0])
+    z = student_to_normal(t.reshape(-1), np.repeat(nu_values, size[1])).reshape(size)
+    log_front = _log_front(nu_values)
     # dz / dw = f_T(t) dt/dw / phi(z), with dt/dw = w (1 + t^2 / nu) / t and f_T ~ exp(-(nu + 1) w^2 / (2 nu))
-    log_pdf = log_ratio_at_zero - 0.5 * (nu + 1) / nu * inner**2 + 0.5 * z * z
+    log_pdf = log_front[:, None] - 0.5 * (nu + 1) / nu * inner**2 + 0.5 * z * z
     dz_dw = np.exp(log_pdf + inner**2 / nu) * inner / t
-    ratio = np.concatenate([[math.exp(log_ratio_at_zero)], z / inner])
-    slope = np.concatenate([[0.0], (dz_dw - z / inner) / inner])
+    at_zero: FloatArray = np.array([math.exp(each) for each in log_front.tolist()])
+    ratio = np.column_stack([at_zero, z / inner])
+    slope = np.column_stack([np.zeros(size[0]), (dz_dw - z / inner) / inner])
     return ratio, slope
 
 
