@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from sfm_audit.audit.kernels.joint_matrix import Blocks, checked_blocks, symmetric_of_blocks, times_blocks
+from sfm_audit.audit.kernels.joint_matrix import Blocks, checked_blocks, times_blocks
 from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
 
 
@@ -51,11 +51,8 @@ class PairMatrix:
 
     @cached_property
     def csr(self) -> sparse.csr_array:
-        """The same for scipy."""
+        """The same for scipy: where there are no kernels any more."""
         size, rows, columns, blocks = self.blocks
-        compiled = symmetric_of_blocks(self.blocks)
-        if compiled is not None:
-            return sparse.csr_array(compiled, shape=self.shape)
         row = np.broadcast_to(rows[:, :, None], blocks.shape).ravel()
         column = np.broadcast_to(columns[:, None, :], blocks.shape).ravel()
         half = sparse.coo_array((blocks.ravel(), (row, column)), shape=(size + 1, size + 1)).tocsr()

@@ -6,8 +6,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.kernels.checked import SmallIntArray, doubles, ints
-from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
+from sfm_audit.audit.kernels.checked import doubles, ints
+from sfm_audit.audit.kernels.library import Doubles, Ints, Size, kernel
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _DONE: Final = 0
@@ -33,18 +33,6 @@ def checked_blocks(given: Blocks) -> Blocks:
         raise ValueError("blocks of another matrix")
     first, second = (np.ascontiguousarray(each, dtype=np.int64) for each in (rows, columns))
     return Blocks(size, first, second, doubles(blocks, blocks.shape))
-
-
-def symmetric_of_blocks(given: Blocks) -> tuple[FloatArray, SmallIntArray, SmallIntArray] | None:
-    """Data, columns and starts of rows of the sparse matrix; None for the numpy path."""
-    function = kernel("joint_symmetric", *_BLOCKS, Size, Ints, SmallInts, Doubles)
-    size, rows, columns, blocks = given
-    num, room = len(blocks), 2 * blocks.size
-    if function is None or not blocks.size or max(size, num, room) >= np.iinfo(np.int32).max:
-        return None
-    starts, indices, data = np.empty(size + 1, dtype=np.int64), np.empty(room, dtype=np.int32), np.empty(room)
-    count = function(size, *blocks.shape, rows, columns, blocks, room, starts, indices, data)
-    return (data[:count], indices[:count], starts.astype(np.int32)) if count >= 0 else None
 
 
 def times_blocks(given: Blocks, values: FloatArray) -> FloatArray | None:

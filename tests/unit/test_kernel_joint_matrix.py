@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy import sparse
 
 from sfm_audit.audit.joint.matrix import PairMatrix, operator_of
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
@@ -14,7 +13,6 @@ from sfm_audit.audit.kernels.joint_matrix import (
     Blocks,
     band_of_blocks,
     checked_blocks,
-    symmetric_of_blocks,
     times_blocks,
 )
 
@@ -31,20 +29,12 @@ def test_blocks_make_the_symmetric_matrix_that_scipy_makes(size):
     np.add.at(expected, (rows[:, :, None], columns[:, None, :]), blocks)
     expected = (expected + expected.T)[:size, :size]
     given = checked_blocks(Blocks(size, rows, columns, blocks))
-    data, indices, starts = symmetric_of_blocks(given)
-    found = sparse.csr_array((data, indices, starts), shape=(size, size))
-    assert found.has_canonical_format
-    assert_allclose(found.toarray(), expected, atol=1e-13)
-    met = np.zeros((size + 1, size + 1), dtype=bool)
-    met[rows[:, :, None], columns[:, None, :]] = True
-    assert found.nnz == (met | met.T)[:size, :size].sum()
     values = rng.normal(size=(size, 3))
     assert_allclose(times_blocks(given, values), expected @ values, atol=1e-13)
     matrix = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
     assert_allclose(matrix.diagonal(), expected.diagonal(), atol=1e-13)
     assert_allclose(operator_of(matrix) @ values[:, 0], expected @ values[:, 0], atol=1e-13)
     with numpy_only():
-        assert symmetric_of_blocks(given) is None
         assert times_blocks(given, values) is None
         alone = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
         assert_allclose(alone.toarray(), expected, atol=1e-13)

@@ -3,67 +3,6 @@
  * All take `num` blocks (height, width) of A at rows (num, height) and columns (num, width); `size` and more is padding. */
 #include "kernel.h"
 
-/* One line of a block: of block k its row `line` or, turned, its column. */
-typedef struct {
-    int32_t block, line, is_turned;
-} block_line;
-
-/* A + A^T as a sparse matrix (size, size), of `num` blocks (height, width) of A at rows (num, height) and columns (num, width);
- * `size` and more is padding. What falls on one place is added in the order of the blocks.
- *
- * starts (size + 1), indices and data (room): columns of a row ascending. Returns how many entries there are, -1 without memory,
- * -2 where they need more room. */
-KERNEL int64_t joint_symmetric(
-    int64_t size, int64_t num, int64_t height, int64_t width, const int64_t *rows, const int64_t *columns, const double *blocks,
-    int64_t room, int64_t *starts, int32_t *indices, double *data) {
-    int64_t words = size / 64 + 1, count = 0;
-    int64_t *first = calloc((size_t)(size + 2), sizeof *first);
-    block_line *line = malloc((size_t)(num * (height + width) + 1) * sizeof *line);
-    double *sum = calloc((size_t)size + 1, sizeof *sum);
-    uint64_t *is_there = calloc((size_t)words, sizeof *is_there);
-    if (!first || !line || !sum || !is_there) {
-        free(first), free(line), free(sum), free(is_there);
-        return -1;
-    }
-    for (int64_t k = 0; k < num * height; k++) first[(rows[k] < size ? rows[k] : size) + 1]++;
-    for (int64_t k = 0; k < num * width; k++) first[(columns[k] < size ? columns[k] : size) + 1]++;
-    for (int64_t r = 0; r <= size; r++) first[r + 1] += first[r];
-    for (int64_t k = 0; k < num; k++) { /* first[r] moves to the end of row r, which is where row r + 1 begins */
-        for (int64_t a = 0; a < height + width; a++) {
-            int64_t r = a < height ? rows[k * height + a] : columns[k * width + a - height];
-            int64_t at = first[r < size ? r : size]++;
-            line[at] = (block_line){(int32_t)k, (int32_t)(a < height ? a : a - height), a >= height};
-        }
-    }
-    for (int64_t r = 0, at = 0; r < size && count >= 0; r++) {
-        starts[r] = count;
-        for (; at < first[r]; at++) {
-            const double *block = blocks + line[at].block * height * width;
-            int64_t length = line[at].is_turned ? height : width, step = line[at].is_turned ? width : 1;
-            const int64_t *where = line[at].is_turned ? rows + line[at].block * height : columns + line[at].block * width;
-            block += line[at].is_turned ? line[at].line : line[at].line * width;
-            for (int64_t c = 0; c < length; c++) {
-                if (where[c] >= size) continue;
-                is_there[where[c] / 64] |= (uint64_t)1 << where[c] % 64;
-                sum[where[c]] += block[c * step];
-            }
-        }
-        for (int64_t w = 0; w < words && count >= 0; w++) {
-            for (int64_t c = 64 * w; is_there[w]; c++, is_there[w] >>= 1) {
-                if (!(is_there[w] & 1)) continue;
-                if (count == room) {
-                    count = -2;
-                    break;
-                }
-                indices[count] = (int32_t)c, data[count++] = sum[c], sum[c] = 0.0;
-            }
-        }
-    }
-    if (count >= 0) starts[size] = count;
-    free(first), free(line), free(sum), free(is_there);
-    return count;
-}
-
 /* out (size, count): A + A^T times values (size, count). */
 KERNEL int64_t joint_times(
     int64_t size, int64_t num, int64_t height, int64_t width, const int64_t *rows, const int64_t *columns, const double *blocks,
