@@ -12,9 +12,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.linalg import blas, lapack, qr
+from scipy.linalg import qr
 
 from sfm_audit.audit.joint.band import Band, band_blocks, in_blocks
+from sfm_audit.audit.joint.lapack import cholesky_in_place, divided_by_factor, inverse_of_factor
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import near_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
@@ -27,7 +28,8 @@ _REACH: Final = 3  # blocks of the inverse beside the diagonal one that are kept
 class BandedFactor:
     """X = (S + F F^T)^-1, with F one unit vector for each null direction of S, in the order of a band.
 
-    diagonal: L_i of each block.    below: C_i = A_(i+1, i) L_i^-T.    null: (D, g) orthonormal G, all null directions.
+    diagonal: L_i of each block, in the lower triangle.    below: C_i = A_(i+1, i) L_i^-T.
+    null: (D, g) orthonormal G, all null directions.
     S X S = S, and S^+ = P X P with P = 1 - G G^T. No shift: where there is no such factor, None is built.
     beside: (D, m) V = [Y E; -1], with Y the inverse of the band alone, zero in the border, and E what couples them.
     corner: (m, m) K, the border's own block of X, so that X = Y + V K V^T.
@@ -74,7 +76,7 @@ class BandedFactor:
 
 def _triangular(lower: FloatArray, right: FloatArray, *, transposed: bool) -> FloatArray:
     """L^-1 right, or L^-T right; as right^T L^-T or right^T L^-1, so that rows in C order need no copy for BLAS."""
-    return np.asarray(blas.dtrsm(1.0, lower, right.T, side=1, lower=1, trans_a=int(not transposed))).T
+    return divided_by_factor(right.T, lower, transposed=not transposed).T
 
 
 def banded_factor(matrix: Symmetric, band: Band, null: FloatArray, inverse_scale: FloatArray) -> BandedFactor | None:
@@ -100,10 +102,9 @@ def banded_factor(matrix: Symmetric, band: Band, null: FloatArray, inverse_scale
         np.einsum("ii->i", block)[...] += added[own]
         if i:
             block -= below[-1] @ below[-1].T
-        lower, info = lapack.dpotrf(block.T, lower=1, clean=1, overwrite_a=1)  # symmetric: in its own memory
-        if info:
+        lower = diagonal[i] = block.T  # symmetric: in its own memory
+        if not cholesky_in_place(lower):
             return None
-        diagonal[i] = lower
         if i < len(coupled):
             below.append(np.ascontiguousarray(_triangular(lower, coupled[i].T, transposed=False).T))
     nothing = np.zeros((len(free), 0))
@@ -116,8 +117,8 @@ def _with_border(factor: BandedFactor, columns: FloatArray, added: FloatArray) -
     start, count = factor.band.num_banded, factor.band.num_border
     beside = factor.solve_band(columns)
     schur = columns[start:] - columns[:start].T @ beside[:start] + np.diag(added)
-    lower, info = lapack.dpotrf(0.5 * (schur + schur.T), lower=1, clean=1)
-    if info:
+    lower = np.asfortranarray(0.5 * (schur + schur.T))
+    if not cholesky_in_place(lower):
         return None
     beside[start:] = -np.eye(count)
     root = _triangular(lower, np.eye(count), transposed=False)
@@ -253,7 +254,7 @@ def banded_inverse(factor: BandedFactor, inverse_scale: FloatArray) -> BandedInv
     flat = np.empty(sum(rows * columns for rows, columns in shapes))
     near = in_blocks(flat, shapes)
     for i in range(len(factor.diagonal) - 1, -1, -1):
-        own, _ = lapack.dpotri(factor.diagonal[i], lower=1)
+        own = inverse_of_factor(factor.diagonal[i])
         own = np.tril(own) + np.tril(own, -1).T
         if i + 1 == len(near):
             near[i][...] = own

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
 from sfm_audit.audit.joint.band import BandBlocks, band_blocks
 from sfm_audit.audit.joint.banded import BandedFactor, BandedInverse
+from sfm_audit.audit.joint.lapack import divided_by_factor, inverse_of_factor
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -64,14 +64,14 @@ def _near(main: BandedInverse, meat: BandBlocks) -> BandBlocks:
     """Y_(i, i) and Y_(i+1, i) of each block i, in the memory of the meat; its border stays."""
     factor, diagonal, below, multipliers = main.factor, meat.diagonal, meat.below, []
     for i, across in enumerate(below):
-        u = np.asarray(blas.dtrsm(1.0, factor.diagonal[i], factor.below[i], side=1, lower=1))
+        u = divided_by_factor(factor.below[i], factor.diagonal[i], transposed=False)
         moved = u @ diagonal[i]
         half = u @ (across - 0.5 * moved).T
         diagonal[i + 1] -= half + half.T
         below[i] -= moved
         multipliers.append(u)
     for i in range(len(diagonal) - 1, -1, -1):
-        pivot, _ = lapack.dpotri(factor.diagonal[i], lower=1)
+        pivot = inverse_of_factor(factor.diagonal[i])
         pivot = np.tril(pivot) + np.tril(pivot, -1).T
         diagonal[i][...] = pivot @ diagonal[i] @ pivot
         if i < len(below):

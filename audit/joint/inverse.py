@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
-from scipy.linalg import lapack
 
 from sfm_audit.audit.joint.band import Band, band_of, dense_of
 from sfm_audit.audit.joint.banded import BandedFactor, banded_factor, banded_inverse
+from sfm_audit.audit.joint.lapack import cholesky_in_place, inverse_of_factor, solve_by_factor
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import dense_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
@@ -242,7 +242,7 @@ class _DenseFactor:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """(D, c), off Z."""
-        out, _ = lapack.dpotrs(self.array, right, lower=1)
+        out = solve_by_factor(self.array, right)
         return np.asarray(out - self.deflated @ (self.deflated.T @ out))
 
 
@@ -275,9 +275,8 @@ def _dense_factor(matrix: Symmetric, inverse_scale: FloatArray, deflated: FloatA
         array = _dense(matrix, inverse_scale, deflated)
         if shift:
             array[np.diag_indices(len(array))] += shift
-        factor, info = lapack.dpotrf(array, lower=1, overwrite_a=1, clean=0)
-        if info == 0:
-            return _DenseFactor(factor, deflated, shift)
+        if cholesky_in_place(array):
+            return _DenseFactor(array, deflated, shift)
         shift = max(_SHIFT, 10.0 * shift)
 
 
@@ -318,7 +317,7 @@ def _null_directions(factor: BandedFactor | _DenseFactor, rounding: FloatArray) 
 
 def _dense_inverse(factor: _DenseFactor, deflated: FloatArray, inverse_scale: FloatArray) -> DenseInverse:
     """From the factor of the scaled, deflated matrix to S^+, in the factor's memory."""
-    inverse, _ = lapack.dpotri(factor.array, lower=1, overwrite_c=1)
+    inverse = inverse_of_factor(factor.array, in_place=True)
     size = len(inverse)
     for start in range(0, size, 512):
         stop = min(start + 512, size)
