@@ -119,7 +119,8 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
     }
 }
 
-/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, and w E^T E of the scalars, of the dense fields its diagonal. */
+/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, at and right of the diagonal, and w E^T E of the scalars, of the dense fields
+ * its diagonal. */
 static void spread_gram(const own_gram *g, double *gram, double *plain, double *dense_plain) {
     int power_x[SCALAR], power_y[SCALAR];
     for (int degree = 0, k = 0; degree <= 4; degree++) {
@@ -143,7 +144,7 @@ static void spread_gram(const own_gram *g, double *gram, double *plain, double *
         }
     }
     for (int i = 0; i < DENSE; i++) {
-        for (int j = 0; j < DENSE; j++) gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = i < j ? g->dd[i][j] : g->dd[j][i];
+        for (int j = 0; j < DENSE; j++) gram[(2 * SCALAR + i) * FIELDS + 2 * SCALAR + j] = g->dd[i][j];
         dense_plain[i] = g->dense_plain[i];
     }
 }
@@ -245,8 +246,8 @@ static void subtract_pairs(
  * place (num_images): zeros, and zeros again afterwards.
  * Out: view (v), own (v), image (m), start (m + 1): see surroundings; num (2): m and rows of right.
  * absorbing (n_i, 3, 2).    right (rows, FIELDS): N^T E - W V^-1 J^T E without T, by image around: its design's columns,
- * then its included fields.    gram (FIELDS, FIELDS).    plain (SCALAR, SCALAR), dense_plain (DENSE): E^T w E, its diagonal.
- * score (FIELDS): E^T y~.    track_score (num_tracks, FIELDS): the same by track.
+ * then its included fields.    gram (FIELDS, FIELDS), at and right of the diagonal.    plain (SCALAR, SCALAR), dense_plain (DENSE):
+ * E^T w E, its diagonal. score (FIELDS): E^T y~.    track_score (num_tracks, FIELDS): the same by track.
  * scores (max_scores): w rows^T y~ of all views, by image around: those of the design, then those of its included fields. */
 WIDE int64_t joint_first(
     const joint_model *m, int64_t *place, int64_t image, const double *scalar, const double *dense, const int32_t *track,
@@ -298,7 +299,8 @@ WIDE int64_t joint_first(
 }
 
 /* Some vectors of up to four views, from number v on: see subtract_scores. */
-INLINE void subtract_some(int rows, int vectors, double *const *to, int v, int64_t width, const double *scores, const double *moved) {
+INLINE void subtract_some(
+    int rows, int vectors, double *const *to, int v, int64_t width, const double *scores, const double *moved) {
     wide sum[4][3];
     for (int i = 0; i < rows; i++) {
         for (int u = 0; u < vectors; u++) sum[i][u] = LOAD(to[i] + v + LANES * u);
