@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from sfm_audit.loaders.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray, UInt32Array, UInt64Array
 from sfm_audit.loaders.camera_models import BY_ID, CameraModel
 
 
@@ -249,13 +249,13 @@ class ObservationTable:
     """All *linked* 2D points (those with a point id), by image in ImageTable order, then by POINTS2D order.
 
     offsets: (I + 1,), image i owns rows offsets[i]:offsets[i + 1].    point2d_idx: (M,) position in POINTS2D.
-    xy_px: (M, 2).    point_idx: (M,) row of PointTable, -1 where the point does not exist (dangling).
+    xy_px: (M, 2).    point_idx: (M,) int32, row of PointTable, -1 where the point does not exist (dangling).
     """
 
     offsets: IntArray
     point2d_idx: UInt32Array
     xy_px: FloatArray
-    point_idx: IntArray
+    point_idx: Int32Array
 
     def __len__(self) -> int:
         return len(self.point_idx)

@@ -228,7 +228,7 @@ def simulated(gamma: float, rng: np.random.Generator) -> tuple[ModelResiduals, i
     """Draw tracks of 6 images with t-distributed variances and noise that grows as scale^gamma, points at optimum."""
     num_images, num_points = 6, 1500
     n = num_images * num_points
-    point_idx = np.tile(np.arange(num_points), num_images)
+    point_idx = np.tile(np.arange(num_points, dtype=np.int32), num_images)
     scale_px = np.exp(rng.normal(0.5, 0.5, n))
     sd = 0.3 * np.sqrt(4.0 / rng.chisquare(4.0, num_points))[point_idx] * (scale_px / np.exp(0.5)) ** gamma
     jacobian = rng.normal(size=(2, 3, n)) * 100.0

@@ -14,7 +14,7 @@ from sfm_audit.audit.consistency.pose_step import lengths_after_pose_step
 from sfm_audit.audit.consistency.readings import fitting_reading
 from sfm_audit.audit.inliers.residuals import image_residuals
 from sfm_audit.audit.inliers.sanity import is_sane, is_usable
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IndexArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord
 
 
@@ -98,7 +98,7 @@ class LinkedPoints:
     image: ImageRecord
     xy_px: FloatArray
     points_xyz: FloatArray
-    point_idx: IntArray
+    point_idx: IndexArray
     rows: IntArray
     residuals_px: FloatArray
     num_behind: int

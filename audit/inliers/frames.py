@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_audit.audit.inliers.stationarity import offset_px, offsets_of_sums, pose_columns
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, IntArray, distinct
 from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 _NUM_POSE = 6
@@ -55,7 +55,7 @@ def frame_offsets_px(
     model: SparseModel,
     frames: Frames,
     offsets: IntArray,
-    point_idx: IntArray,
+    point_idx: IndexArray,
     on_points: tuple[FloatArray, FloatArray],
     *,
     sums: tuple[FloatArray, FloatArray] | None = None,

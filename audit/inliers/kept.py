@@ -11,6 +11,7 @@ from sfm_audit.audit.cameras import is_fisheye
 from sfm_audit.audit.inliers.sanity import params_of, usable_cameras
 from sfm_audit.audit.inliers.small import SmallImages, groups, project_small
 from sfm_audit.audit.inliers.stationarity import offsets_of_sums
+from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.kernels.projection import LENSES, NO_LENS, NUM_PARAMS, Projected, Scene, project_scene
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray, distinct
 from sfm_audit.loaders.camera_models import BY_ID
@@ -163,7 +164,7 @@ def scene_of(model: SparseModel) -> Scene:
         lenses[rows] = LENSES[lens.name], is_fisheye(lens), len(extra)
     return Scene(
         observations.offsets,
-        observations.point_idx,
+        small_ints(observations.point_idx, len(observations)),
         np.ascontiguousarray(observations.xy_px),
         np.ascontiguousarray(model.points.xyz_world),
         np.ascontiguousarray(images.quat_cam_from_world_wxyz),

@@ -129,7 +129,7 @@ def inlier_set(model: SparseModel, residuals: ModelResiduals, image_idx: int) ->
         model.image(image_idx),
         observations.xy_px.take(row, axis=0),
         model.points.xyz_world.take(point_idx, axis=0),
-        point_idx,
+        point_idx.astype(np.int64),
         num_dangling=int(residuals.num_dangling[image_idx]),
         num_behind=int(residuals.num_behind[image_idx]),
         num_nonfinite=int(residuals.num_nonfinite[image_idx]),

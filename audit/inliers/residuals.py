@@ -19,7 +19,7 @@ from sfm_audit.audit.inliers.sanity import (
     is_usable,
 )
 from sfm_audit.audit.inliers.stationarity import pose_offset_px, pose_offsets_px
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray
 from sfm_audit.loaders.model import CameraRecord, ImageRecord, SparseModel, rotation_from_quat
 
 _MAX_JOINED: Final = 64
@@ -69,7 +69,7 @@ class ModelResiduals:
 
     offsets: IntArray
     observation_row: Int32Array
-    point_idx: IntArray
+    point_idx: Int32Array
     residuals_px: FloatArray
     point_jacobian: FloatArray
     pose_offset_px: FloatArray
@@ -85,7 +85,7 @@ class ModelResiduals:
 
 
 def image_residuals(
-    image: ImageRecord, xy_px: FloatArray, xyz_world: FloatArray, point_idx: IntArray
+    image: ImageRecord, xy_px: FloatArray, xyz_world: FloatArray, point_idx: IndexArray
 ) -> ImageResiduals:
     """Project the linked points of one image and keep those that can be audited.
 
@@ -165,7 +165,7 @@ def _residuals(
     return residuals, projection.d_xy_d_cam, d_extra
 
 
-def _points_of(model: SparseModel, point_idx: IntArray) -> FloatArray:
+def _points_of(model: SparseModel, point_idx: IndexArray) -> FloatArray:
     """(m, 3) world points; NaN where dangling."""
     if not len(model.points):
         return np.full((len(point_idx), 3), np.nan)
@@ -235,7 +235,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
     waiting.flush()
     offsets, pose_offset = kept.pack(), kept.pose_offset_px
     all_in = len(kept.rows) == len(observations)
-    point_idx = observations.point_idx if all_in else observations.point_idx[kept.rows]
+    point_idx = (observations.point_idx if all_in else observations.point_idx[kept.rows]).astype(np.int32, copy=False)
     if (frames := claimed_frames(model)) is not None:
         on_points = (kept.residuals_px, kept.point_jacobian)
         pose_offset = frame_offsets_px(model, frames, offsets, point_idx, on_points, sums=kept.pose_sums)

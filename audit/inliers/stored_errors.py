@@ -74,8 +74,10 @@ def compare_stored_errors(model: SparseModel, residuals: ModelResiduals) -> Stor
     stored_error_px = model.points.stored_error_px
     num_points = len(stored_error_px)
     length = reprojection_errors_px(model, residuals)
-    count = np.bincount(residuals.point_idx, minlength=num_points)
-    total = np.bincount(residuals.point_idx, weights=length, minlength=num_points)
+    point_idx = residuals.point_idx.astype(np.intp)  # as numpy follows them: once, not at every call
+    count = np.bincount(point_idx, minlength=num_points)
+    total = np.bincount(point_idx, weights=length, minlength=num_points)
+    del point_idx
     seen = count > 0
     recomputed = total[seen] / count[seen]
     has_stored = (stored_error_px >= 0) & is_sane(stored_error_px)

@@ -25,7 +25,7 @@ _WINDOW: Final = (
     Ints,
     Ints,
     Doubles,
-    Ints,
+    SmallInts,
     Doubles,
     SmallInts,
     _Strided,
@@ -45,7 +45,7 @@ class Observed:
 
     xyz_world: FloatArray
     xy_px: FloatArray
-    point_idx: IntArray
+    point_idx: Int32Array
     observation_row: Int32Array
     residuals_px: FloatArray
     point_jacobian: FloatArray
@@ -64,12 +64,12 @@ class Observed:
         cls,
         xyz_world: FloatArray,
         xy_px: FloatArray,
-        rows: tuple[IntArray, Int32Array],
+        rows: tuple[IntArray | Int32Array, Int32Array],
         residuals_px: FloatArray,
         point_jacobian: FloatArray,
     ) -> Observed:
         """Take the arrays as they are where they have the types of the kernels; ``rows`` of points and 2D points."""
-        point_idx, observation_row = np.ascontiguousarray(rows[0], dtype=np.int64), small_ints(rows[1], len(rows[1]))
+        point_idx, observation_row = (small_ints(each, len(each)) for each in rows)
         residuals_px, point_jacobian = (
             each if each.dtype == np.float64 and _is_by_rows(each) else np.ascontiguousarray(each, dtype=np.float64)
             for each in (residuals_px, point_jacobian)

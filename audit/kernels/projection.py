@@ -54,7 +54,7 @@ class Scene:
     """
 
     offsets: IntArray
-    point_idx: IntArray
+    point_idx: Int32Array
     xy_px: FloatArray
     xyz_world: FloatArray
     quaternions: FloatArray
@@ -96,7 +96,7 @@ def project_scene(scene: Scene) -> Projected | None:
     """
     function = kernel(
         "sfm_project",
-        *(Size, Size, Ints, Ints, Doubles, Doubles, Doubles, Doubles, Ints, Ints, Doubles),
+        *(Size, Size, Ints, SmallInts, Doubles, Doubles, Doubles, Doubles, Ints, Ints, Doubles),
         *(Size, SmallInts, Doubles, Doubles, Ints, Doubles, Ints, Doubles, Ints),
     )
     if function is None:

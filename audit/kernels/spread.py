@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
-from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IndexArray, Int32Array, IntArray
 
 
 class Inliers(NamedTuple):
@@ -20,7 +20,7 @@ class Inliers(NamedTuple):
 
     offsets: IntArray
     observation_row: Int32Array
-    point_idx: IntArray
+    point_idx: IndexArray
     xy_px: FloatArray
     xyz_world: FloatArray
     quaternions: FloatArray
@@ -52,7 +52,7 @@ def image_spread(inliers: Inliers, image_idxs: IntArray, size_px: FloatArray, gr
         Ints,
         Ints,
         SmallInts,
-        Ints,
+        SmallInts,
         Doubles,
         Doubles,
         Doubles,
@@ -69,8 +69,8 @@ def image_spread(inliers: Inliers, image_idxs: IntArray, size_px: FloatArray, gr
     _check(inliers, image_idxs)
     num = len(image_idxs)
     out = Lie(np.empty(num), np.empty(num, dtype=np.int64), np.empty(num))
-    offsets, point_idx = (np.ascontiguousarray(each, dtype=np.int64) for each in (inliers.offsets, inliers.point_idx))
-    rows = offsets, small_ints(inliers.observation_row, len(inliers.observation_row)), point_idx
+    offsets = np.ascontiguousarray(inliers.offsets, dtype=np.int64)
+    rows = (offsets, *(small_ints(each, len(each)) for each in (inliers.observation_row, inliers.point_idx)))
     values = (np.ascontiguousarray(each, dtype=np.float64) for each in inliers[3:])
     sizes = np.ascontiguousarray(size_px, dtype=np.float64)
     status = run(num, np.ascontiguousarray(image_idxs, dtype=np.int64), *rows, *values, sizes, grid, *out)

@@ -7,8 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
+from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.kernels.library import Bytes, Double, Doubles, Ints, Size, SmallInts, kernel, kernels_in_use
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray, UInt8Array
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray, UInt8Array
 
 _LANES = 4
 _NUM_COLUMNS = 10
@@ -55,7 +56,7 @@ class Points:
 
     def whiten(
         self,
-        observations: tuple[FloatArray, FloatArray, IntArray],
+        observations: tuple[FloatArray, FloatArray, IndexArray],
         used: BoolArray,
         limits: tuple[int, float],
         out: tuple[FloatArray, BoolArray],
@@ -69,16 +70,17 @@ class Points:
         """
         residuals_px, point_jacobian, point_idx = observations
         track_sq, removed = np.zeros(len(self.rank)), np.zeros(2)
-        of_rows = (Size, Doubles, Doubles, Ints, Bytes)
+        of_rows = (Size, Doubles, Doubles, SmallInts, Bytes)
         run = kernel("track_whiten", *of_rows, Doubles, Double, Double, Doubles, Bytes, Doubles, Doubles)
         if run is not None:
-            rows = (point_idx.size, residuals_px, point_jacobian, point_idx, used.view(np.uint8))
+            n = point_idx.size
+            rows = (n, residuals_px, point_jacobian, small_ints(point_idx, n), used.view(np.uint8))
             run(*rows, self.columns, *map(float, limits), out[0], out[1].view(np.uint8), track_sq, removed)
         return track_sq, float(removed[0]), float(removed[1])
 
 
 def track_others(
-    tracks: tuple[FloatArray, Int32Array], observations: tuple[IntArray, FloatArray, BoolArray], rows: range
+    tracks: tuple[FloatArray, Int32Array], observations: tuple[Int32Array, FloatArray, BoolArray], rows: range
 ) -> tuple[FloatArray, Int32Array] | None:
     """Return what is left of a track without an observation, for each of ``rows``.
 
@@ -92,7 +94,7 @@ def track_others(
     tuple
         sums of squares (m,) px^2, NaN where not verified, and degrees of freedom (m,); None for the numpy path
     """
-    run = kernel("track_others", Size, Size, Size, Ints, Doubles, SmallInts, Doubles, Bytes, Doubles, SmallInts)
+    run = kernel("track_others", Size, Size, Size, SmallInts, Doubles, SmallInts, Doubles, Bytes, Doubles, SmallInts)
     (track_sq, dof), (point_idx, whitened_px, verified) = tracks, observations
     if run is None or rows.step != 1:
         return None
@@ -107,7 +109,7 @@ def track_others(
 
 
 def sums(
-    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IntArray, used: BoolArray, num_points: int
+    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IndexArray, used: BoolArray, num_points: int
 ) -> Points:
     """Add up information and gradient of each point over the observations that are used.
 
@@ -121,9 +123,9 @@ def sums(
     if n and not (point_idx.min() >= 0 and point_idx.max() < num_points):
         raise IndexError(f"observations of points beyond the {num_points} there are")
     points = Points(np.zeros((num_points, _NUM_COLUMNS)), np.empty(num_points, dtype=np.uint8))
-    run = kernel("track_sums", Size, Doubles, Doubles, Ints, Bytes, Doubles)
+    run = kernel("track_sums", Size, Doubles, Doubles, SmallInts, Bytes, Doubles)
     if run is not None:
-        run(n, residuals_px, point_jacobian, point_idx, used.view(np.uint8), points.columns)
+        run(n, residuals_px, point_jacobian, small_ints(point_idx, n), used.view(np.uint8), points.columns)
     return points
 
 

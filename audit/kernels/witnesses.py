@@ -6,8 +6,9 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
+from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.kernels.library import Bytes, Double, Doubles, Ints, Size, SmallInts, kernel
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray
 
 Pairs: TypeAlias = tuple[IntArray, IntArray, IntArray]
 Looks: TypeAlias = tuple[IntArray, IntArray, BoolArray, FloatArray, FloatArray]
@@ -18,7 +19,7 @@ _PER_SIGHT: Final = 4  # images that should see a point, for each that does
 _TOO_MANY: Final = 1 << 30
 
 
-def shared_points(offsets: IntArray, point_idx: IntArray, num_points: int) -> tuple[Turned, Pairs] | None:
+def shared_points(offsets: IntArray, point_idx: IndexArray, num_points: int) -> tuple[Turned, Pairs] | None:
     """Return which images see each point, and how many points pairs of images share; None for the numpy path.
 
     Parameters
@@ -32,18 +33,18 @@ def shared_points(offsets: IntArray, point_idx: IntArray, num_points: int) -> tu
     Pairs
         first < second, number (m,)
     """
-    run = kernel("witness_shared", Size, Size, Ints, Ints, Ints, SmallInts, Size, Ints, Ints, Ints)
+    run = kernel("witness_shared", Size, Size, Ints, SmallInts, Ints, SmallInts, Size, Ints, Ints, Ints)
     num_images = len(offsets) - 1
     if run is None or not _in_range(point_idx, num_points) or not _are_offsets(offsets, len(point_idx)):
         return None
     if max(num_images, len(point_idx)) >= _TOO_MANY:
         return None
-    point_idx = _ints(point_idx)
+    rows = small_ints(point_idx, len(point_idx))
     seen_offsets, images = np.empty(num_points + 1, dtype=np.int64), np.empty(len(point_idx), dtype=np.int32)
     capacity = _PER_IMAGE * num_images
     for _ in range(2):
         first, second, num_shared = (np.empty(capacity, dtype=np.int64) for _ in range(3))
-        given = num_images, num_points, offsets, point_idx, seen_offsets, images
+        given = num_images, num_points, offsets, rows, seen_offsets, images
         num = run(*given, capacity, first, second, num_shared)
         if num < 0:
             return None

@@ -121,13 +121,13 @@ class ModelSums:
 
     def points(self, image: int) -> IntArray:
         """(n,) rows of the points that the image in this row sees."""
-        return self.residuals.point_idx[self.residuals.rows(image)]
+        return self.residuals.point_idx[self.residuals.rows(image)].astype(np.int64)
 
     def points_of(self, images: Sequence[int]) -> IntArray:
         """Return the points that these images see, ascending rows of the point table."""
         seen_by = [self.points(image) for image in images]
         if _FEW_OF_POINTS * sum(map(len, seen_by)) < len(self.model.points):
-            return distinct(np.concatenate(seen_by)).astype(np.int64)
+            return distinct(np.concatenate(seen_by))
         seen = np.zeros(len(self.model.points), dtype=np.bool_)
         for points in seen_by:
             seen[points] = True

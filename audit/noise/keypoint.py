@@ -32,7 +32,7 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.fits import fit_variance
 from sfm_audit.audit.noise.prior import NU0_RANGE
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, model_tracks, track_noise
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, IntArray
 
 GAMMA_RANGE: Final = (0.0, 2.0)
 _MAX_TRACKS: Final = 20_000  # a systematic subset of tracks is enough to fit one number
@@ -132,7 +132,7 @@ def _only(residuals: ModelResiduals, known: BoolArray) -> ModelResiduals:
 
 
 def fit_scale_power(
-    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IntArray, log_scale: FloatArray, used: BoolArray
+    residuals_px: FloatArray, point_jacobian: FloatArray, point_idx: IndexArray, log_scale: FloatArray, used: BoolArray
 ) -> ScalePower:
     r"""Fit gamma by maximum likelihood over the tracks of a model.
 
@@ -173,7 +173,7 @@ def fit_scale_power(
     return ScalePower(float(found.x), gain, len(tracks)) if gain > 0.0 else ScalePower(0.0, 0.0, len(tracks))
 
 
-def _chosen_tracks(point_idx: IntArray, used: BoolArray) -> IntArray:
+def _chosen_tracks(point_idx: IndexArray, used: BoolArray) -> IntArray:
     """Points with at least two used observations, a systematic subset where there are very many."""
     length = np.bincount(point_idx[used])
     tracks = np.flatnonzero(length >= 2)

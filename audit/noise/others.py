@@ -69,7 +69,7 @@ class ByTrack:
     left_out: (n,) observations that are told by the full tracks; None: nothing is.
     """
 
-    point_idx: IntArray
+    point_idx: Int32Array
     whitened_px: FloatArray
     verified: BoolArray
     tables: tuple[TrackTable, ...]

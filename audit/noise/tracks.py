@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_audit.audit.kernels import tracks as compiled
+from sfm_audit.audit.kernels.checked import small_ints
 from sfm_audit.audit.noise.others import EVERY, ByRow, ByTrack, Others, TrackTable
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray
 
 _SUFFICIENT_DETERMINANT = 1e-6  # of the information matrix with unit diagonal: closed-form inverse, else eigenvectors
 _RANK_THRESHOLD = 1e-10  # eigenvalues of that matrix, relative to the largest: singular values of J below 1e-5
@@ -55,7 +56,7 @@ class TrackStatistics:
 def track_statistics(
     residuals_px: FloatArray,
     point_jacobian: FloatArray,
-    point_idx: IntArray,
+    point_idx: IndexArray,
     num_points: int,
     *,
     min_track_length: int = 3,
@@ -97,15 +98,15 @@ def track_statistics(
 
 
 def _compiled(
-    observations: tuple[FloatArray, FloatArray, IntArray],
+    observations: tuple[FloatArray, FloatArray, IndexArray],
     num_points: int,
     limits: tuple[int, float],
     left_out: BoolArray | None,
 ) -> TrackStatistics:
     """`track_statistics` by the compiled kernels; tracks of which a point is not well determined are inverted here."""
     residuals_px, point_jacobian = (np.ascontiguousarray(array) for array in observations[:2])
-    point_idx = np.ascontiguousarray(observations[2])
-    n = point_idx.size
+    n = observations[2].size
+    point_idx = small_ints(observations[2], n)
     used = [np.ones(n, dtype=np.bool_)] + ([] if left_out is None else [~left_out])
     out = np.empty((2, n)), np.empty(n, dtype=np.bool_)
     removable = total = 0.0
@@ -135,7 +136,7 @@ def _replace_rows(full: TrackStatistics, rows: BoolArray, part: TrackStatistics)
 def _statistics(
     residuals_px: FloatArray,
     point_jacobian: FloatArray,
-    point_idx: IntArray,
+    point_idx: IndexArray,
     num_points: int,
     limits: tuple[int, float],
 ) -> TrackStatistics:
@@ -182,7 +183,7 @@ def _finite_columns(point_jacobian: FloatArray) -> BoolArray:
 def _whiten(
     residuals_px: FloatArray,
     point_jacobian: FloatArray,
-    point_idx: IntArray,
+    point_idx: IndexArray,
     inverse: FloatArray,
     limits: tuple[BoolArray, float],
 ) -> tuple[FloatArray, FloatArray, float]:
@@ -199,9 +200,11 @@ def _whiten(
     """
     verified, min_eigenvalue = limits
     gradient, square = np.empty_like(inverse[:3]), np.empty(point_idx.size)
+    followed = _followed(point_idx)
     for axis in range(3):
         _sum_of_two_products(point_jacobian[:, axis], residuals_px, square)
-        gradient[axis] = sum_by_point(square, point_idx, inverse.shape[1])
+        gradient[axis] = sum_by_point(square, followed, inverse.shape[1])
+    del followed
     step = gradient  # A^+ J^T eps: where the points would move
     for part in _chunks(inverse.shape[1]):
         step[:, part] = symmetric_times(inverse[:, part], gradient[:, part])
@@ -238,9 +241,14 @@ def _chunks(n: int) -> list[slice]:
     return [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
 
 
-def sum_by_point(values: FloatArray, point_idx: IntArray, num_points: int) -> FloatArray:
+def sum_by_point(values: FloatArray, point_idx: IndexArray, num_points: int) -> FloatArray:
     """Sum values (n,) of observations by their track: (P,)."""
     return np.bincount(point_idx, weights=values, minlength=num_points).astype(np.float64, copy=False)
+
+
+def _followed(point_idx: IndexArray) -> IntArray:
+    """Rows as wide as numpy follows them, made once for several sums."""
+    return point_idx.astype(np.int64, copy=False)
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -263,14 +271,15 @@ def symmetric_times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def inverse_information(
-    point_jacobian: FloatArray, point_idx: IntArray, num_points: int
+    point_jacobian: FloatArray, point_idx: IndexArray, num_points: int
 ) -> tuple[FloatArray, Int32Array]:
     """Return the (pseudo-)inverse (6, P) of each track's information A = sum J^T J, and its rank (P,)."""
     information = np.empty((6, num_points))
-    product = np.empty(point_idx.size)
+    product, followed = np.empty(point_idx.size), _followed(point_idx)
     for row, (i, j) in enumerate(_SYMMETRIC):
         _sum_of_two_products(point_jacobian[:, i], point_jacobian[:, j], product)
-        information[row] = sum_by_point(product, point_idx, num_points)
+        information[row] = sum_by_point(product, followed, num_points)
+    del product, followed
     rank = np.empty(num_points, dtype=np.int32)
     for part in _chunks(num_points):
         information[:, part], rank[part] = _inverses(information[:, part])

@@ -123,7 +123,7 @@ def sparse_model(scene: SimulatedScene, claim: Claim, location: str = "simulated
             scene.offsets,
             (np.arange(len(scene.point_idx)) - scene.offsets[scene.image_idx]).astype(np.uint32),
             scene.xy_px,
-            scene.point_idx,
+            scene.point_idx.astype(np.int32),
         ),
         findings=(),
     )

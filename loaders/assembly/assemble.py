@@ -28,7 +28,7 @@ def assemble(raw: RawModel, location: str, file_format: str) -> SparseModel:
         image_id=raw.images.image_id,
         name=raw.images.name,
         camera_id=raw.images.camera_id,
-        camera_idx=rows_of(raw.cameras.camera_id.astype(np.uint64), raw.images.camera_id.astype(np.uint64)),
+        camera_idx=rows_of(raw.cameras.camera_id.astype(np.uint64), raw.images.camera_id).astype(np.int64),
         quat_cam_from_world_wxyz=placed.poses[:, :4].copy(),
         translation_cam_from_world=placed.poses[:, 4:].copy(),
         num_points2d=raw.images.num_points2d,

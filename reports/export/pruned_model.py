@@ -179,7 +179,7 @@ def kept_part(model: SparseModel, pruning: Pruning) -> SparseModel:
             offsets_of(counts[keeps]),
             observations.point2d_idx[rows],
             observations.xy_px[rows],
-            number[observations.point_idx[rows]].astype(np.int64),
+            number[observations.point_idx[rows]].astype(np.int32),
         ),
     )
 

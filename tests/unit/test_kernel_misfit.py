@@ -233,11 +233,11 @@ def test_the_kernel_takes_no_other_arrays(tmp_path):
     taken = Observed.of(
         observed.xyz_world,
         observed.xy_px,
-        (observed.point_idx.astype(np.int32), observed.observation_row),
+        (observed.point_idx.astype(np.int64), observed.observation_row),
         wide[:, : len(observed.point_idx)],
         observed.point_jacobian,
     )
-    assert taken.point_idx.dtype == np.int64
+    assert taken.point_idx.dtype == np.int32
     assert misfit_sums(taken, window) is not None
 
 

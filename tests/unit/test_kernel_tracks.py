@@ -107,7 +107,7 @@ def test_others_of_some_rows(leave_out):
 
 
 def test_others_of_a_track_that_is_not_there_are_no_memory():
-    sq, dof, point_idx = np.ones(2), np.ones(2, dtype=np.int32), np.array([0, 1, 2])
+    sq, dof, point_idx = np.ones(2), np.ones(2, dtype=np.int32), np.array([0, 1, 2], dtype=np.int32)
     rows = point_idx, np.ones((2, 3)), np.ones(3, dtype=np.bool_)
     assert track_others((sq, dof), rows, range(2)) is not None
     for tracks in ((sq, dof), (np.ones(3), dof), (np.ones(3), np.ones(4, dtype=np.int32))):

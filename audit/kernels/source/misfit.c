@@ -24,7 +24,7 @@ typedef double row_t[SIZE] __attribute__((aligned(64)));
 /* The model, as it lies in memory. residuals: 2 rows, jacobian: 6 rows of these strides. */
 typedef struct {
     const double *xyz_world, *xy_px, *residuals, *jacobian;
-    const int64_t *point;
+    const int32_t *point;
     const int32_t *observation;
     const int64_t *facts;
     int64_t residual_stride, jacobian_stride;
@@ -135,7 +135,7 @@ INLINE void fill_points(const model_t *model, const image_t *image, const block_
     const double *q = image->numbers + QUAT, *t = image->numbers + SHIFT;
     row_t world[3];
     for (int k = 0; k < SIZE; ++k)
-        for (int j = 0; j < 3; ++j) world[j][k] = model->xyz_world[3 * model->point[b->rows[k]] + j];
+        for (int j = 0; j < 3; ++j) world[j][k] = model->xyz_world[3 * (int64_t)model->point[b->rows[k]] + j];
     for (int k = 0; k < SIZE; ++k) { /* Eigen's order of operations, as loaders.model.moved */
         const double x = world[0][k], y = world[1][k], z = world[2][k];
         const double ux = 2.0 * (q[2] * z - q[3] * y), uy = 2.0 * (q[3] * x - q[1] * z), uz = 2.0 * (q[1] * y - q[2] * x);
@@ -247,7 +247,7 @@ static int fill_rows(int64_t from, int64_t stop, block_t *b) {
 
 /* What lies anywhere in memory of an observation that is evaluated soon. */
 INLINE void ask_ahead(const model_t *model, int64_t row) {
-    SOON(model->xyz_world + 3 * model->point[row]), SOON(model->xy_px + 2 * model->observation[row]);
+    SOON(model->xyz_world + 3 * (int64_t)model->point[row]), SOON(model->xy_px + 2 * model->observation[row]);
 }
 
 /* `fill_rows`, while the observations after these are on their way. */
@@ -323,7 +323,7 @@ static void write_sums(const sums_t *s, int q, double *gram, double *on_y) {
 /* What all kernels here begin with: images, whose observations are rows[2 i] .. rows[2 i + 1] - 1, and the model. */
 #define WINDOW                                                                                                         \
     int64_t num_images, const int64_t *rows, const double *numbers, const double *extra, const int64_t *extra_offsets, \
-        const int64_t *facts, const double *xyz_world, const int64_t *point, const double *xy_px,                      \
+        const int64_t *facts, const double *xyz_world, const int32_t *point, const double *xy_px,                      \
         const int32_t *observation, const double *residuals, int64_t residual_stride, const double *jacobian,          \
         int64_t jacobian_stride
 #define MODEL {xyz_world, xy_px, residuals, jacobian, point, observation, facts, residual_stride, jacobian_stride}

@@ -331,7 +331,8 @@ INLINE void eucm(Block *b, const double *c) { /* alpha beta */
 /* ---- an image ---- */
 
 typedef struct {
-    const int64_t *offsets, *point_idx, *camera_idx, *lenses;
+    const int64_t *offsets, *camera_idx, *lenses;
+    const int32_t *point_idx;
     const double *xy_px, *xyz_world, *quaternions, *translations, *params;
 } Scene;
 
@@ -357,7 +358,7 @@ INLINE void gather(Block *b, const Scene *s, int64_t image, int64_t first, int n
     Column x, y, z;
     b->n = n;
     for (int64_t k = first + BLOCK; k < first + 2 * BLOCK && k < last; k++)
-        SOON(s->xyz_world + 3 * (s->point_idx[k] < 0 ? 0 : s->point_idx[k]));
+        SOON(s->xyz_world + 3 * (int64_t)(s->point_idx[k] < 0 ? 0 : s->point_idx[k]));
     EACH(k, b) {
         const int64_t point = s->point_idx[first + k];
         const double *xyz = s->xyz_world + 3 * (point < 0 ? 0 : point);
@@ -550,13 +551,13 @@ WIDE static int project_image(const Scene *s, const Found *f, int64_t image, Blo
  * jacobian (2, 3, M) in the world frame; extra: (e, 2, n) of each image from extra_offsets on; counts (I, 3): inliers,
  * dangling, behind; pose_sums (I, 27): for each of six pose columns its products with it and those behind it, then with
  * the residuals; status (I). Returns how many images are left to numpy. */
-KERNEL int64_t sfm_project(int64_t first, int64_t last, const int64_t *offsets, const int64_t *point_idx,
+KERNEL int64_t sfm_project(int64_t first, int64_t last, const int64_t *offsets, const int32_t *point_idx,
                            const double *xy_px, const double *xyz_world, const double *quaternions,
                            const double *translations, const int64_t *camera_idx, const int64_t *lenses,
                            const double *params, int64_t capacity, int32_t *rows, double *residuals, double *jacobian,
                            const int64_t *extra_offsets, double *extra, int64_t *counts, double *pose_sums,
                            int64_t *status) {
-    const Scene scene = {offsets, point_idx, camera_idx, lenses, xy_px, xyz_world, quaternions, translations, params};
+    const Scene scene = {offsets, camera_idx, lenses, point_idx, xy_px, xyz_world, quaternions, translations, params};
     const Found found = {capacity, residuals, jacobian, extra, pose_sums, extra_offsets, rows, counts};
     int64_t num_left = 0;
     Block *block = calloc(1, sizeof *block);

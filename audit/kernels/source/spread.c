@@ -206,7 +206,7 @@ static double median(double *values, int64_t n, double *within)
  * quaternions (I, 4), translations (I, 3): cam_from_world. size_px: (num, 2). Out, (num,) each: hull_px2,
  * occupied_cells, depth: median Zc. */
 KERNEL int64_t image_spread(int64_t num, const int64_t *images, const int64_t *offsets, const int32_t *observation_row,
-                            const int64_t *point_idx, const double *xy_px, const double *xyz_world,
+                            const int32_t *point_idx, const double *xy_px, const double *xyz_world,
                             const double *quaternions, const double *translations, const double *size_px, int64_t grid,
                             double *hull_px2, int64_t *occupied_cells, double *depth)
 {
@@ -226,9 +226,9 @@ KERNEL int64_t image_spread(int64_t num, const int64_t *images, const int64_t *o
         const double *q = quaternions + 4 * images[b], tz = translations[3 * images[b] + 2];
         double *y = x + room, *z = y + room;
         for (int64_t i = 0; i < n; i++) {
-            const double *seen = xy_px + 2 * observation_row[first + i], *point = xyz_world + 3 * point_idx[first + i];
+            const double *seen = xy_px + 2 * observation_row[first + i], *point = xyz_world + 3 * (int64_t)point_idx[first + i];
             if (i + AHEAD < n)
-                SOON(xyz_world + 3 * point_idx[first + i + AHEAD]);
+                SOON(xyz_world + 3 * (int64_t)point_idx[first + i + AHEAD]);
             x[i] = seen[0];
             y[i] = seen[1];
             z[i] = depth_of(q, tz, point);

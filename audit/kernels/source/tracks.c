@@ -7,12 +7,12 @@ enum { INVERSE = 0, STEP = 6, LENGTH = 9, POINT = 10 }; /* of a point: 3 x 3 upp
 enum { AHEAD = 16 };
 
 /* The points of an image lie all over memory: ask for one some observations before its turn. */
-INLINE void expect(int64_t n, const int64_t *point_idx, int64_t k, const double *points)
+INLINE void expect(int64_t n, const int32_t *point_idx, int64_t k, const double *points)
 {
     if (k + AHEAD >= n)
         return;
-    SOON(points + point_idx[k + AHEAD] * POINT);
-    SOON(points + point_idx[k + AHEAD] * POINT + POINT - 1); /* a point lies in two lines of the cache */
+    SOON(points + (int64_t)point_idx[k + AHEAD] * POINT);
+    SOON(points + (int64_t)point_idx[k + AHEAD] * POINT + POINT - 1); /* a point lies in two lines of the cache */
 }
 
 static inline int read_jacobian(int64_t n, const double *from, int64_t k, double j[6])
@@ -29,7 +29,7 @@ static inline int read_jacobian(int64_t n, const double *from, int64_t k, double
 }
 
 /* Add up information, gradient and length of each track in points (P, 10), over the rows that are used. */
-KERNEL int64_t track_sums(int64_t n, const double *residuals, const double *jacobian, const int64_t *point_idx,
+KERNEL int64_t track_sums(int64_t n, const double *residuals, const double *jacobian, const int32_t *point_idx,
                           const uint8_t *used, double *points)
 {
     for (int64_t k = 0; k < n; k++) {
@@ -37,7 +37,7 @@ KERNEL int64_t track_sums(int64_t n, const double *residuals, const double *jaco
         if (!used[k])
             continue;
         double j[6], x = residuals[k], y = residuals[n + k];
-        double *p = points + point_idx[k] * POINT;
+        double *p = points + (int64_t)point_idx[k] * POINT;
         p[LENGTH] += 1.0;
         if (!read_jacobian(n, jacobian, k, j))
             continue;
@@ -91,7 +91,7 @@ static inline double form(const double *a, const double *u, const double *v)
 
 /* Whiten the used rows: e and whether verified, and each track's sum of squares (P,) off its point. removed: what
  * moving the points would take away of the sum of squares, and that sum. */
-KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *jacobian, const int64_t *point_idx,
+KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *jacobian, const int32_t *point_idx,
                             const uint8_t *used, const double *points, double min_length, double min_eigenvalue,
                             double *whitened, uint8_t *verified, double *track_sq, double *removed)
 {
@@ -102,7 +102,7 @@ KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *ja
         if (!used[k])
             continue;
         double j[6];
-        const double *p = points + point_idx[k] * POINT, *step = p + STEP;
+        const double *p = points + (int64_t)point_idx[k] * POINT, *step = p + STEP;
         const int differentiable = read_jacobian(n, jacobian, k, j);
         const double mx = j[0] * step[0] + j[1] * step[1] + j[2] * step[2];
         const double my = j[3] * step[0] + j[4] * step[1] + j[5] * step[2];
@@ -122,11 +122,11 @@ KERNEL int64_t track_whiten(int64_t n, const double *residuals, const double *ja
 }
 
 /* What is left of a track without the observation, for rows from start on: sum of squares, degrees of freedom (num,). */
-KERNEL int64_t track_others(int64_t n, int64_t start, int64_t num, const int64_t *point_idx, const double *track_sq,
+KERNEL int64_t track_others(int64_t n, int64_t start, int64_t num, const int32_t *point_idx, const double *track_sq,
                             const int32_t *track_dof, const double *whitened, const uint8_t *verified,
                             double *other_sq, int32_t *other_dof)
 {
-    const int64_t *point = point_idx + start;
+    const int32_t *point = point_idx + start;
     const double *e = whitened + start;
     for (int64_t k = 0; k < num; k++) {
         if (k + AHEAD < num) {

@@ -12,7 +12,7 @@ enum { LAST = 1 << 30, AHEAD = 16 }; /* LAST: on the last image of each point, w
 
 /* Turns (n,) observations round: next[p] moves to the end of the images that see point p, ascending, each once, which
  * start at starts[p] of seen_image (n,). place: (n,) where the image stands in it, -1 where it has been before. */
-static void turn_round(int64_t num_images, const int64_t *offsets, const int64_t *point_idx, const int64_t *starts,
+static void turn_round(int64_t num_images, const int64_t *offsets, const int32_t *point_idx, const int64_t *starts,
                        int32_t *next, int32_t *seen_image, int32_t *place)
 {
     const int64_t num = offsets[num_images];
@@ -67,7 +67,7 @@ static void count_shared(int64_t i, const int32_t *place, int64_t size, const in
 /* seen_offsets (num_points + 1), seen_image (n,): the images that see each point, ascending, each once. first < second,
  * num_shared (capacity,) each: pairs of images with the points that they share, by first and then by second.
  * Returns the number of pairs, of which those that fit are written; negative without memory. */
-KERNEL int64_t witness_shared(int64_t num_images, int64_t num_points, const int64_t *offsets, const int64_t *point_idx,
+KERNEL int64_t witness_shared(int64_t num_images, int64_t num_points, const int64_t *offsets, const int32_t *point_idx,
                               int64_t *seen_offsets, int32_t *seen_image, int64_t capacity, int64_t *first,
                               int64_t *second, int64_t *num_shared)
 {
