@@ -18,6 +18,9 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 _MIN_BLOCKS: Final = 4  # fewer are no band
 _FAR_REACHING: Final = (8, 4, 2)  # times as many couplings as a column commonly has: it belongs to the border
 _MAX_BORDER: Final = 128
+_MORE_BEHIND: Final = (
+    4  # blocks than in front of the middle: what the middle has at hand there is computed before both sides are
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,12 +30,15 @@ class Band:
     order: (D,) column at each place.    place: (D,) of each column.    width: how far places couple.
     starts: (b + 1,) where each block begins and the last one ends, none longer than the width; the border behind them
     couples with everything.
+    ends: (b,) behind the last place that is asked for beside one of the block's: places that couple with the same
+    column, as all of an image's neighbours do, and the next block.
     """
 
     order: IntArray
     place: IntArray
     width: int
     starts: IntArray
+    ends: IntArray
 
     @property
     def num_banded(self) -> int:
@@ -47,6 +53,16 @@ class Band:
     def number(self, place: IntArray) -> IntArray:
         """Which block has each of some places; one behind the last for the border."""
         return np.asarray(np.searchsorted(self.starts, place, side="right") - 1)
+
+    @property
+    def middle(self) -> int:
+        """Which block is eliminated last: in front of it from the first on, behind it from the last one on."""
+        return max(0, (len(self.starts) - 1 - _MORE_BEHIND) // 2)
+
+    def chains(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Return in which order blocks are eliminated on either side of the middle, each with the one it leads to."""
+        middle, last = self.middle, len(self.starts) - 2
+        return [(i, i + 1) for i in range(middle)], [(i, i - 1) for i in range(last, middle, -1)]
 
     @property
     def num_border(self) -> int:
@@ -83,13 +99,20 @@ def _ordered(pattern: sparse.csr_array, group: IntArray, border: IntArray) -> Ba
     sizes = np.bincount(group, minlength=rank.size)[inner]
     ends = np.cumsum(sizes[by_rank])
     last = ends[rank[inner]] - 1  # place of each group's last column
-    furthest, used = last.copy(), np.flatnonzero(np.diff(within.indptr))
-    if used.size:
-        of_used = np.maximum.reduceat(last[within.indices], within.indptr[used])
-        furthest[used] = np.maximum(last[used], of_used)
+    furthest = _furthest(within, last)
     reach = np.repeat(furthest[by_rank], sizes[by_rank])
     width = max(int((reach - np.arange(reach.size)).max(initial=0)), 1)
-    return Band(order, place, width, _starts(reach, width))
+    starts = _starts(reach, width)
+    together = np.repeat(_furthest(within, furthest)[by_rank], sizes[by_rank])
+    return Band(order, place, width, starts, _ends(together, starts))
+
+
+def _furthest(pattern: sparse.csr_array, place: IntArray) -> IntArray:
+    """(G,) the last place of each group and of those that it couples with."""
+    out, used = place.copy(), np.flatnonzero(np.diff(pattern.indptr))
+    if used.size:
+        out[used] = np.maximum(place[used], np.maximum.reduceat(place[pattern.indices], pattern.indptr[used]))
+    return out
 
 
 def _starts(reach: IntArray, width: int) -> IntArray:
@@ -103,6 +126,15 @@ def _starts(reach: IntArray, width: int) -> IntArray:
         here = starts[-1]
         starts.append(min(max(int(behind[max(here - 1, 0)]), here + (width + 1) // 2), reach.size))
     return np.array(starts, dtype=np.int64)
+
+
+def _ends(together: IntArray, starts: IntArray) -> IntArray:
+    """(b,) behind all that is asked for beside places up to the end of each block, and not before the next one ends.
+
+    together : (n,) last place that is asked for beside each
+    """
+    behind = np.maximum.accumulate(together) + 1
+    return np.asarray(np.maximum(behind[starts[1:] - 1], np.append(starts[2:], starts[-1:])[: starts.size - 1]))
 
 
 class BandBlocks(NamedTuple):

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sfm_audit.audit.joint.band import BandBlocks, band_blocks
-from sfm_audit.audit.joint.banded import BandedFactor, BandedInverse
-from sfm_audit.audit.joint.lapack import divided_by_factor, inverse_of_factor
+from sfm_audit.audit.joint.banded import BandedFactor, across, both_ways
+from sfm_audit.audit.joint.banded_inverse import BandedInverse
+from sfm_audit.audit.joint.lapack import add_both, add_product, mirror, multiply
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
@@ -19,10 +20,10 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
     Notes
     -----
     S^+ M S^+ = P X M X P: scores are off the points, track by track, so that M has the null directions of S, M G = 0.
-    With E T E^T block diagonal by eliminating block after block (T = X^-1, U_i as in `banded_inverse`), M follows:
-    N_i = M_(i+1, i) - U_i M_(i, i),  M_(i+1, i+1) -= H_i + H_i^T,  H_i = U_i (M_(i+1, i) - U_i M_(i, i) / 2)^T.
-    Then back, Y = X M X, D_i = T_i^-1, with B_i = X_(i+1, i+1) N_i D_i and V_i = Y_(i+1, i+1) U_i:
-    Y_(i, i+1) = (B_i - V_i)^T,  Y_(i, i) = D_i M_(i, i) D_i - H_i - H_i^T,  H_i = U_i^T (B_i - V_i / 2).
+    As block after block is eliminated (U_i, P_i and n, the next block, as in `BandedFactor`), M follows:
+    N_i = M_(n, i) - U_i M_(i, i),  M_(n, n) -= H_i + H_i^T,  H_i = U_i (M_(n, i) - U_i M_(i, i) / 2)^T.
+    Then back, Y = X M X, with B_i = X_(n, n) N_i P_i and V_i = Y_(n, n) U_i:
+    Y_(n, i) = B_i - V_i,  Y_(i, i) = P_i M_(i, i) P_i - H_i - H_i^T,  H_i = U_i^T (B_i - V_i / 2).
     All this is of the band; with X + V K V^T in the place of X and Q = (X + V K V^T) M V, the border adds
     B V^T + V B^T, B = Q K - V K V^T M V K / 2.
     """
@@ -62,23 +63,52 @@ def _of_border(factor: BandedFactor, times: Callable[[FloatArray], FloatArray]) 
 
 def _near(main: BandedInverse, meat: BandBlocks) -> BandBlocks:
     """Y_(i, i) and Y_(i+1, i) of each block i, in the memory of the meat; its border stays."""
-    factor, diagonal, below, multipliers = main.factor, meat.diagonal, meat.below, []
-    for i, across in enumerate(below):
-        u = divided_by_factor(factor.below[i], factor.diagonal[i], transposed=False)
-        moved = u @ diagonal[i]
-        half = u @ (across - 0.5 * moved).T
-        diagonal[i + 1] -= half + half.T
-        below[i] -= moved
-        multipliers.append(u)
-    for i in range(len(diagonal) - 1, -1, -1):
-        pivot = inverse_of_factor(factor.diagonal[i])
-        pivot = np.tril(pivot) + np.tril(pivot, -1).T
-        diagonal[i][...] = pivot @ diagonal[i] @ pivot
-        if i < len(below):
-            u = multipliers.pop()  # what was used is given back
-            moved = main.near[i + 1][:, : len(u)] @ (below[i] @ pivot)
-            after = diagonal[i + 1] @ u
-            half = u.T @ (moved - 0.5 * after)
-            diagonal[i] -= half + half.T
-            np.subtract(moved, after, out=below[i])
+    factor, band, diagonal = main.factor, main.factor.band, meat.diagonal
+    middle = band.middle
+
+    def inwards(order: list[tuple[int, int]]) -> FloatArray:
+        """What the middle loses by the blocks on one side of it."""
+        lost = np.zeros_like(diagonal[middle])
+        for block, following in order:
+            step, beside = factor.step(block), across(meat.below, middle, block)
+            half = beside.copy(order="K")
+            mirror(diagonal[block].T)
+            add_product(half, step, diagonal[block], -0.5)
+            to, sign = (lost, 1.0) if following == middle else (diagonal[following], -1.0)
+            add_both(to.T, step, half, sign)
+            np.subtract(half, beside, out=beside)
+            beside += half
+        return lost
+
+    def outwards(order: list[tuple[int, int]]) -> None:
+        for block, following in reversed(order):
+            step, beside, own = factor.step(block), across(meat.below, middle, block), diagonal[block]
+            _between(own, factor.pivots[block])
+            moved, after = np.empty_like(step), np.empty_like(step)
+            add_product(after, beside, factor.pivots[block], keep=0.0)
+            add_product(moved, main.near[following][:, : len(step)], after, keep=0.0)
+            add_product(after, diagonal[following], step, 0.5, keep=0.0)
+            moved -= after
+            np.subtract(moved, after, out=beside)
+            add_both(own.T, step.T, moved.T, -1.0)
+            mirror(own.T)
+
+    for lost in both_ways(band, inwards):
+        diagonal[middle] -= lost
+    mirror(diagonal[middle].T)
+    _between(diagonal[middle], factor.pivots[middle])
+    mirror(diagonal[middle].T)
+    both_ways(band, outwards)
     return meat
+
+
+def _between(own: FloatArray, pivot: FloatArray) -> None:
+    """Turn M into the lower triangle, in Fortran order, of P M P; of M that triangle is taken.
+
+    With K the triangle and half the diagonal: (P K) P + P (P K)^T.
+    """
+    lower = own.T
+    np.einsum("ii->i", lower)[...] *= 0.5
+    half = pivot.copy()
+    multiply(half, lower)
+    add_both(lower, half, pivot, keep=0.0)

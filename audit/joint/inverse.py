@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
 from sfm_audit.audit.joint.band import Band, band_of, dense_of
-from sfm_audit.audit.joint.banded import BandedFactor, banded_factor, banded_inverse
+from sfm_audit.audit.joint.banded import BandedFactor, banded_factor
+from sfm_audit.audit.joint.banded_inverse import BandedInverse, banded_inverse
 from sfm_audit.audit.joint.lapack import cholesky_in_place, inverse_of_factor, solve_by_factor
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import dense_entries
@@ -187,13 +188,13 @@ def joint_inverse(matrix: Symmetric, before: FloatArray, gauge: FloatArray) -> J
     if not size:
         empty = np.zeros((0, 0))
         return JointInverse(DenseInverse(empty), nothing, nothing, empty, np.zeros(0, dtype=bool), 0, nothing)
-    factor, inverse_scale, free, further = _deflated_factor(matrix, before, gauge)
+    factor, banded, inverse_scale, free, further = _deflated(matrix, before, gauge, with_inverse=True)
     lost = (inverse_scale == 0) | ((further**2).sum(axis=1) > _IN_NULL)
     main: SymmetricInverse
-    if isinstance(factor, BandedFactor):
-        main = banded_inverse(factor, inverse_scale)
-    else:
+    if isinstance(factor, _DenseFactor):
         main = _dense_inverse(factor, np.hstack([free, further]), inverse_scale)
+    else:
+        main = banded_inverse(factor, inverse_scale) if banded is None else banded
     unscaled = free * inverse_scale[:, None]
     return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1], unscaled)
 
@@ -202,16 +203,28 @@ def joint_solution(matrix: Symmetric, before: FloatArray, gauge: FloatArray, rig
     """Return S^+ right (D,) as `joint_inverse` would have it, without the inverse."""
     if not len(right):
         return right
-    factor, inverse_scale, _, further = _deflated_factor(matrix, before, gauge)
+    factor, _, inverse_scale, _, further = _deflated(matrix, before, gauge, with_inverse=False)
     step = factor.solve((right * inverse_scale)[:, None])[:, 0]
     step -= further @ (further.T @ step)  # the last ones that were found are not in the factor where there are too many
     return np.asarray(step * inverse_scale)
 
 
-def _deflated_factor(
-    matrix: Symmetric, before: FloatArray, gauge: FloatArray
-) -> tuple[BandedFactor | _DenseFactor, FloatArray, FloatArray, FloatArray]:
-    """Factor in units of unit diagonal; (D,) 1 / unit, 0 of dead columns; directions of the gauge, and others found."""
+class _Deflated(NamedTuple):
+    """The factor in units of unit diagonal.
+
+    banded: S^+, where it was asked for and there is a band.    inverse_scale: (D,) 1 / unit, 0 of dead columns.
+    free, further: (D, g) directions of the gauge, (D, k) others found.
+    """
+
+    factor: BandedFactor | _DenseFactor
+    banded: BandedInverse | None
+    inverse_scale: FloatArray
+    free: FloatArray
+    further: FloatArray
+
+
+def _deflated(matrix: Symmetric, before: FloatArray, gauge: FloatArray, *, with_inverse: bool) -> _Deflated:
+    """Deflate the gauge, and further null directions as long as there are some."""
     diagonal = matrix.diagonal()
     dead = diagonal <= _DEAD * before
     scale = np.where(dead, 1.0, np.sqrt(np.where(dead, 1.0, diagonal)))
@@ -222,6 +235,9 @@ def _deflated_factor(
     deflated, further = free, free[:, :0]
     while True:
         factor = _factor(matrix, inverse_scale, deflated, band)
+        banded = banded_inverse(factor, inverse_scale) if with_inverse and isinstance(factor, BandedFactor) else None
+        if banded is not None and _cannot_be_null(banded.trace, rounding):
+            break
         found = _null_directions(factor, rounding)
         if not found.shape[1]:
             break
@@ -229,7 +245,17 @@ def _deflated_factor(
         deflated = np.hstack([deflated, found])
         if further.shape[1] >= _MAX_NULL:
             break
-    return factor, inverse_scale, free, further
+    return _Deflated(factor, banded, inverse_scale, free, further)
+
+
+def _cannot_be_null(trace: float, rounding: FloatArray) -> bool:
+    """Whether no direction can be what `_null_directions` looks for.
+
+    No eigenvalue of the inverse is above its trace, none of S thus below its reciprocal; and (sum |v| rounding)^2 is at
+    most the sum of the squares of ``rounding``. Twice as far as that, for what both are wrong by themselves.
+    """
+    unsure = _ROUNDING * float(rounding @ rounding)
+    return bool(0.0 < 2.0 * trace * (NULL_EIGENVALUE + unsure) < 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

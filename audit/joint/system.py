@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import linalg as sparse_linalg
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.joint.banded import BandedInverse
+from sfm_audit.audit.joint.banded_inverse import BandedInverse
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
 from sfm_audit.audit.joint.inverse import JointInverse, SymmetricInverse, joint_inverse, joint_solution

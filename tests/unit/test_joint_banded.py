@@ -8,18 +8,28 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from joint_reference import SPEC, model_of, system_of
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import sparse
 
+from sfm_audit.audit.joint import band as band_module
+from sfm_audit.audit.joint import banded
 from sfm_audit.audit.joint import inverse as joint_inverses
 from sfm_audit.audit.joint.band import _starts, band_blocks, band_of, dense_of
-from sfm_audit.audit.joint.banded import BandedInverse, banded_factor
+from sfm_audit.audit.joint.banded import banded_factor
+from sfm_audit.audit.joint.banded_inverse import BandedInverse
 from sfm_audit.audit.joint.banded_sandwich import banded_sandwiches
 from sfm_audit.audit.joint.gauge import gauge_directions
-from sfm_audit.audit.joint.inverse import DenseInverse, joint_inverse, joint_solution
+from sfm_audit.audit.joint.inverse import (
+    NULL_EIGENVALUE,
+    DenseInverse,
+    _cannot_be_null,
+    joint_inverse,
+    joint_solution,
+)
 from sfm_audit.audit.joint.matrix import csr_of
 from sfm_audit.audit.joint.normal import reduced_systems, score_meat
 from sfm_audit.audit.joint.own import _walds, walds
+from sfm_audit.audit.kernels.threads import threads
 
 STREET = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
 
@@ -69,6 +79,14 @@ def test_a_street_is_a_band_and_a_room_is_none(street, reduced):
     assert np.abs(row[within] - column[within]).max() == band.width
     assert np.abs(band.number(row[within]) - band.number(column[within])).max() == 1
     assert np.diff(band.starts).max() <= band.width
+    inner = band.order[: band.num_banded]
+    pattern = (abs(csr_of(reduced.matrix)) > 0)[inner][:, inner]
+    row, column = (pattern @ pattern).nonzero()  # both couple with the same column
+    behind = row <= column
+    furthest = np.zeros(len(band.ends), dtype=np.int64)
+    np.maximum.at(furthest, band.number(row[behind]), column[behind] + 1)
+    assert (band.ends >= furthest).all()
+    assert (band.ends == np.maximum(np.maximum.accumulate(furthest), [*band.starts[2:], band.starts[-1]])).all()
     assert (band.order[band.place] == np.arange(len(band.order))).all()
     is_shared = len(street.model.cameras) == 1
     assert np.sort(band.order[band.num_banded :]).tolist() == (own_of(street, 0).tolist() if is_shared else [])
@@ -114,6 +132,62 @@ def test_a_solution_needs_no_inverse(street, reduced):
     found = joint_solution(reduced.matrix, reduced.before, gauge, reduced.right)
     assert_allclose(found, street.base.inverse.main.apply(reduced.right), rtol=1e-9, atol=1e-12 * np.abs(found).max())
     assert joint_solution(reduced.matrix, reduced.before[:0], gauge[:0], reduced.right[:0]).shape == (0,)
+
+
+def test_both_sides_of_the_middle_in_two_threads_say_the_same(street, monkeypatch):
+    """To the last bit; also where all blocks are on one side of it."""
+    blocks = [*street.observations.layout.columns]
+    meat, main = score_meat(street.observations, street.base.left_px), street.base.inverse.main
+    monkeypatch.setattr(banded, "_WORTH_A_THREAD", 0.0)
+    by_two: list[int] = []
+    original = banded.together
+    monkeypatch.setattr(banded, "together", lambda *both: (by_two.append(len(both)), original(*both)))
+    with threads(2):
+        found = inverted(street).main
+        covariances = banded_sandwiches(found, meat, blocks)
+    assert len(by_two) == 4
+    assert_array_equal(found.flat, main.flat)
+    assert_array_equal(found.pull, main.pull)
+    for one, other in zip(covariances, banded_sandwiches(main, meat, blocks), strict=True):
+        assert_array_equal(one, other)
+    monkeypatch.setattr(band_module, "_MORE_BEHIND", 10**6)
+    one_way = inverted(street).main
+    assert one_way.factor.band.middle == 0
+    assert_allclose(one_way.flat, main.flat, atol=1e-9 * np.abs(main.flat).max())
+    for one, other in zip(banded_sandwiches(one_way, meat, blocks), covariances, strict=True):
+        assert_allclose(one, other, atol=1e-8 * np.abs(other).max())
+
+
+def test_the_trace_rules_null_directions_out_where_there_are_none(street, reduced, scale, monkeypatch):
+    """No direction is looked for then; where it says nothing the search finds as many."""
+    unit = reduced.matrix.toarray() / scale / scale[:, None]
+    expected = np.linalg.pinv(unit, rcond=1e-11, hermitian=True)
+    assert_allclose(street.base.inverse.main.trace, np.trace(expected), rtol=1e-8)
+    searches: list[int] = []
+    original = joint_inverses._null_directions
+    monkeypatch.setattr(joint_inverses, "_null_directions", lambda *given: (searches.append(1), original(*given))[1])
+    assert inverted(street).num_null == 0
+    assert not searches
+    monkeypatch.setattr(joint_inverses, "_cannot_be_null", lambda *_: False)
+    assert inverted(street).num_null == 0
+    assert searches
+
+
+@pytest.mark.parametrize(
+    ("trace", "rounding", "ruled_out"),
+    [
+        (0.49 / NULL_EIGENVALUE, 0.0, True),
+        (0.51 / NULL_EIGENVALUE, 0.0, False),
+        (0.49 / 512 / np.finfo(float).eps / 1e8, 1e4, True),
+        (0.51 / 512 / np.finfo(float).eps / 1e8, 1e4, False),
+        (-1.0, 0.0, False),
+        (0.0, 0.0, False),
+        (np.nan, 0.0, False),
+    ],
+)
+def test_what_a_trace_says(trace, rounding, ruled_out):
+    """Rounding counts by the sum of squares, in both places."""
+    assert _cannot_be_null(trace, np.array([0.6, 0.8]) * rounding) is ruled_out
 
 
 def test_a_dead_column_is_zero_and_leaves_the_others_alone(street, monkeypatch):
@@ -171,8 +245,9 @@ def test_blocks_of_many_images_are_those_of_one(street, dense):
     far = np.concatenate([band.order[:4], band.order[band.num_banded - 4 : band.num_banded]])[None]
     assert all(street.base.inverse.main._is_near(each) for each in columns)
     edge = np.array(
-        [[band.order[band.starts[1] - 1], band.order[band.starts[4] + k], *band.order[4:10]] for k in (-1, 0)]
+        [[band.order[band.starts[1] - 1], band.order[band.ends[0] + k], *band.order[4:10]] for k in (-1, 0)]
     )
+    assert [street.base.inverse.main._is_near(each) for each in edge] == [True, False]
     assert not street.base.inverse.main._is_near(far[0])
     asked = np.concatenate([columns, far, edge])  # the last column that is at hand, and the first that is not
     for main in (street.base.inverse.main, dense.main):

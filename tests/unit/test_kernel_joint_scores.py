@@ -15,7 +15,7 @@ from sfm_audit.audit.engine.model import ModelAuditor
 from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.joint import image_scores as image_score_module
 from sfm_audit.audit.joint import joint_misfit, misfit
-from sfm_audit.audit.joint.banded import BandedInverse
+from sfm_audit.audit.joint.banded_inverse import BandedInverse
 from sfm_audit.audit.joint.candidates import candidate_scores
 from sfm_audit.audit.joint.group_test import group_root
 from sfm_audit.audit.joint.image_scores import ScoresOfMany, sums_of_base
