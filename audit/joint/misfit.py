@@ -120,6 +120,8 @@ def joint_misfit(
     with the largest effect as parameters of their own; at most 8 rounds; not if more than half of the tested images
     would then be included. An included image keeps its tests and is no hypothesis any more. Only images that share
     points with an included one are tested again: what an included field did to others it did through shared points.
+    Between two rounds these are the ones with any p < alpha; all others when nobody is left to include, and if that
+    finds somebody, rounds go on.
     """
     has_columns = system.observations.layout.has_columns
     left_out = np.zeros_like(has_columns) if excluded is None else excluded & has_columns
@@ -151,22 +153,39 @@ class _Rounds:
         self.tests: list[dict[MisfitGroup, GroupTest]] = []
         self._worth: list[dict[MisfitGroup, Worth]] = [{}] * num_images
         self._q = np.full((num_images, len(GROUPS)), np.nan)
+        self._least_p = np.full(num_images, np.nan)  # of all groups of an image
         self._round = np.full(num_images, -1)
 
     def run(self) -> JointMisfit:
         """Test, include, test again."""
         self._test(self._tested)
         self._beside = None  # from here on the base may be another
-        num_tested = np.count_nonzero(self._tested)
+        stale = np.zeros_like(self._tested)  # share points with what was included since they were tested
         for number in range(MAX_ROUNDS):
-            waiting = np.where(self._round < 0, self._effects(), 0.0)
-            new = (waiting > self._include_from) & (waiting >= _SHARE_OF_LARGEST * waiting.max(initial=0.0))
-            if not new.any() or 2 * np.count_nonzero(new | (self._round >= 0)) > num_tested:
+            new = self._next()
+            if not new.any() and stale.any():
+                self._test(stale)
+                stale[:] = False
+                new = self._next()
+            if not new.any():
                 break
             self._include(new)
             self._round[new] = number
-            self._test(self._touched(new) & self._tested & (self._round < 0))
-        return self._result(bool(2 * np.count_nonzero(self._effects() > self._tau_px) > num_tested))
+            stale = (stale | self._touched(new)) & self._tested & (self._round < 0)
+            suspects = stale & (self._least_p < self._alpha)
+            self._test(suspects)
+            stale &= ~suspects
+        if stale.any():
+            self._test(stale)
+        wrong = np.count_nonzero(self._effects() > self._tau_px)
+        return self._result(bool(2 * wrong > np.count_nonzero(self._tested)))
+
+    def _next(self) -> BoolArray:
+        """(I,) whose fields are to be free next; nobody's if more than half of the tested images would then be."""
+        waiting = np.where(self._round < 0, self._effects(), 0.0)
+        new = (waiting > self._include_from) & (waiting >= _SHARE_OF_LARGEST * waiting.max(initial=0.0))
+        most = 2 * np.count_nonzero(new | (self._round >= 0)) > np.count_nonzero(self._tested)
+        return np.zeros_like(new) if most else np.asarray(new)
 
     def _test(self, chosen: BoolArray) -> None:
         images = np.flatnonzero(chosen).tolist()
@@ -180,8 +199,9 @@ class _Rounds:
 
         over_ranges(tested, len(images), counts)
         waiting = np.flatnonzero(self._tested & (self._round < 0))
-        p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()])
-        self._q[waiting] = benjamini_hochberg(holm(p.reshape(-1, len(GROUPS))).T).T
+        p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()]).reshape(-1, len(GROUPS))
+        self._q[waiting] = benjamini_hochberg(holm(p).T).T
+        self._least_p[waiting] = np.fmin.reduce(p, axis=1)
 
     def _scores_of(self, images: Sequence[int]) -> list[CandidateScores | None]:
         """Of each image, all that its tests ask for."""

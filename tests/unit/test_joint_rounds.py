@@ -144,6 +144,21 @@ def test_rounds_end_after_eight(monkeypatch):
     answers = [[*[QUIET] * k, found()] for k in range(30)]
     result = Rounds(monkeypatch, answers).run()
     assert result.round_included[:9] == (0, 1, 2, 3, 4, 5, 6, 7, -1)
+    assert result.effect_px[8:10].tolist() == [1.0, 0.0]  # asked against the last base all the same
+
+
+def test_between_rounds_those_in_doubt_are_asked_again_and_all_others_once_at_the_end(monkeypatch):
+    doubt, none, unknown = found(p=0.0499), found(p=0.05), found(p=NAN, smooth=GroupTest(0.04, 0.01, 0.0, 2, S.TESTED))
+    rounds = Rounds(monkeypatch, [found(1.0), found(0.3), found(0.05), doubt, none, unknown, QUIET, QUIET])
+    result = rounds.run()
+    assert result.round_included[:3] == (0, 1, -1)
+    assert rounds.num_asked == [1, 2, 3, 3, 2, 3, 2, 2]
+    late = Rounds(monkeypatch, [found(1.0), [QUIET, found(0.3)], *[QUIET] * 5])  # shows itself at the end: on with it
+    assert late.run().round_included[:2] == (0, 1)
+    assert late.num_asked == [1, 2, 3, 3, 3, 3, 3]
+    full = Rounds(monkeypatch, [found(1.0), found(0.3), found(0.3), QUIET])
+    assert full.run().round_included == (0, -1, -1, -1)  # three of four would be too many
+    assert full.num_asked == [1, 2, 2, 2]
 
 
 def test_q_is_holm_over_groups_and_benjamini_hochberg_over_those_that_wait(monkeypatch):
