@@ -43,7 +43,7 @@ SANITIZE: Final = (
 )
 RUNTIME: Final = "libasan.so"
 SOURCES_OF: Final = "audit/kernels/source"
-NO_KERNEL: Final = frozenset({"sfm_audit_sources"})
+NO_KERNEL: Final = frozenset({"sfm_audit_sources", "sfm_audit_runs_here"})
 
 
 def call_pair_sums(rng: np.random.Generator) -> None:
@@ -97,7 +97,7 @@ _LEAK: Final = re.compile(r"^(?:Direct|Indirect) leak .*?(?:\n\n|\Z)", re.MULTIL
 def symbols(folder: Path = build_kernels.SOURCES) -> set[str]:
     """Return the names of all kernels of the sources."""
     text = "\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.c")))
-    return set(re.findall(r"^\s*(?:WIDE\s+)?KERNEL\b[^;{(]*?(\w+)\s*\(", text, flags=re.MULTILINE)) - NO_KERNEL
+    return set(re.findall(r"^\s*KERNEL\b[^;{(]*?(\w+)\s*\(", text, flags=re.MULTILINE)) - NO_KERNEL
 
 
 class Recorder:

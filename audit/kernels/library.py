@@ -68,6 +68,8 @@ def _loaded() -> tuple[ctypes.CDLL | None, str]:
         return None, f"{LIBRARY.name} cannot be loaded: {error}"
     if built_from != sources_hash():
         return None, f"{LIBRARY.name} is of other sources: run scripts/build_kernels.py"
+    if not found.sfm_audit_runs_here():
+        return None, f"{LIBRARY.name} needs a processor with AVX2 and FMA (made since 2013)"
     return found, f"{LIBRARY.name} of sources {built_from[:_SHOWN_HASH]}"
 
 

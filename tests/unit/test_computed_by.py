@@ -1,6 +1,8 @@
 """Which path numbers took, compiled kernels or numpy, stands in the run folder, is said, and binds nobody."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from run_samples import write_models
@@ -82,6 +84,19 @@ def test_a_library_of_other_sources_is_not_used(tmp_path, monkeypatch, built_fro
         path = path_taken()
         assert (path.name, path.sources) == ("numpy", None)
         assert said in path.reason
+    finally:
+        kernels._loaded.cache_clear()
+
+
+def test_a_library_for_other_processors_is_not_used(monkeypatch):
+    old = SimpleNamespace(sfm_audit_sources=lambda: kernels.sources_hash().encode(), sfm_audit_runs_here=lambda: 0)
+    monkeypatch.setattr(kernels.ctypes, "CDLL", lambda _: old)
+    monkeypatch.setattr(kernels, "LIBRARY", Path(__file__))
+    monkeypatch.delenv("SFM_AUDIT_KERNELS", raising=False)
+    kernels._loaded.cache_clear()
+    try:
+        assert path_taken().name == "numpy"
+        assert "needs a processor with AVX2 and FMA" in path_taken().reason
     finally:
         kernels._loaded.cache_clear()
 

@@ -62,9 +62,7 @@ def sources(tmp_path, monkeypatch):
     folder.mkdir()
     for name in ("kernel.h", "version.c"):
         shutil.copy(build_kernels.SOURCES / name, folder)
-    (folder / "one.c").write_text(
-        '#include "kernel.h"\nKERNEL WIDE int64_t one(double *x) { x[0] = 1.0; return DONE; }\n'
-    )
+    (folder / "one.c").write_text('#include "kernel.h"\nKERNEL int64_t one(double *x) { x[0] = 1.0; return DONE; }\n')
     monkeypatch.setattr(build_kernels, "SOURCES", folder)
     return folder
 
@@ -94,9 +92,26 @@ def test_a_library_carries_the_hash_of_its_sources(tmp_path, monkeypatch, source
 @pytest.mark.usefixtures("sources")
 def test_cc_is_the_compiler_with_its_arguments(tmp_path, monkeypatch):
     (name,) = [name for name in build_kernels.COMPILERS if shutil.which(name)][:1]
-    monkeypatch.setenv("CC", f"{name} -DSFM_ONE_CLONE '-DWORDS=1 + 1'")
-    assert build_kernels.compiler() == [name, "-DSFM_ONE_CLONE", "-DWORDS=1 + 1"]
+    monkeypatch.setenv("CC", f"{name} -DONE '-DWORDS=1 + 1'")
+    assert build_kernels.compiler() == [name, "-DONE", "-DWORDS=1 + 1"]
     assert build_kernels.build(tmp_path / "compiled.so") is None
+
+
+@pytest.mark.parametrize(
+    ("machine", "source", "flags"),
+    [
+        ("x86_64", "joint_scores", ["-mavx2", "-mfma", "-ffp-contract=fast"]),
+        ("AMD64", "misfit", ["-mavx2", "-mfma", "-ffp-contract=fast"]),
+        ("x86_64", "tracks", ["-mavx2", "-mfma", "-ffp-contract=off"]),
+        ("x86_64", "version", ["-ffp-contract=off"]),  # asked whether the others can run
+        ("arm64", "joint", ["-ffp-contract=fast"]),
+        ("aarch64", "spread", ["-ffp-contract=off"]),
+        ("ppc64le", "joint", ["-ffp-contract=off"]),
+    ],
+)
+def test_products_and_sums_are_fused_where_every_processor_can(monkeypatch, machine, source, flags):
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert build_kernels.processor_flags(source) == flags
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,10 @@ def test_kernels_are_found_as_they_are_written(tmp_path):
         '#include "kernel.h"\n'
         "static int64_t no_kernel(double x) { return 0; }\n"
         "KERNEL int64_t first(const double *x) { return DONE; }\n"
-        "KERNEL WIDE int64_t second(\n    const double *x) { return DONE; }\n"
-        "WIDE KERNEL int64_t\nthird(int64_t n) { return DONE; }\n"
-        "KERNEL const char *sfm_audit_sources(void) { return 0; }\n",
+        "KERNEL int64_t second(\n    const double *x) { return DONE; }\n"
+        "KERNEL int64_t\nthird(int64_t n) { return DONE; }\n"
+        "KERNEL const char *sfm_audit_sources(void) { return 0; }\n"
+        "KERNEL int64_t sfm_audit_runs_here(void) { return 1; }\n",
         encoding="utf-8",
     )
     assert fuzz_kernels.symbols(tmp_path) == {"first", "second", "third"}
@@ -33,7 +34,7 @@ def test_kernels_are_found_as_they_are_written(tmp_path):
 def test_every_exported_name_of_the_sources_is_a_kernel():
     """What the loader can bind is what the script looks for."""
     text = "\n".join(path.read_text(encoding="utf-8") for path in fuzz_kernels.build_kernels.SOURCES.glob("*.c"))
-    marked = sum(line.lstrip().startswith(("KERNEL", "WIDE KERNEL")) for line in text.splitlines())
+    marked = sum(line.lstrip().startswith("KERNEL") for line in text.splitlines())
     assert len(fuzz_kernels.symbols()) == marked - len(fuzz_kernels.NO_KERNEL)
 
 

@@ -172,7 +172,7 @@ INLINE double spread_of(Image *im, const double *design, double size) {
     return sqrt(sum_of(im->weights, im->n) / (double)im->n) * size;
 }
 
-WIDE static int fit(Image *im, const double *residuals, int64_t total, const int32_t *rows, const double *xy_px,
+static int fit(Image *im, const double *residuals, int64_t total, const int32_t *rows, const double *xy_px,
                     int with_affine, double *out) {
     const double n = (double)im->n, largest = MAX_MAGNITUDE * MAX_MAGNITUDE * n;
     fill(im, residuals, total, rows, xy_px);

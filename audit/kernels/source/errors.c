@@ -31,7 +31,7 @@ INLINE int sum_up(int64_t n, const double *x, const double *y, double *length, d
 }
 
 /* Summaries (num_images, SUMMARY) of columns offsets[i] : offsets[i + 1] of residuals (2, n). */
-KERNEL WIDE int64_t error_summaries(int64_t num_images, int64_t n, const int64_t *offsets, const double *residuals,
+KERNEL int64_t error_summaries(int64_t num_images, int64_t n, const int64_t *offsets, const double *residuals,
                                     double *out, uint8_t *status)
 {
     int64_t most = 0;

@@ -249,7 +249,7 @@ static void subtract_pairs(
  * then its included fields.    gram (FIELDS, FIELDS), at and right of the diagonal.    plain (SCALAR, SCALAR), dense_plain (DENSE):
  * E^T w E, its diagonal. score (FIELDS): E^T y~.    track_score (num_tracks, FIELDS): the same by track.
  * scores (max_scores): w rows^T y~ of all views, by image around: those of the design, then those of its included fields. */
-WIDE int64_t joint_first(
+int64_t joint_first(
     const joint_model *m, int64_t *place, int64_t image, const double *scalar, const double *dense, const int32_t *track,
     int64_t num_tracks, int64_t max_rows, int32_t *view, int32_t *own, int64_t *around, int64_t *start,
     int64_t *num, double *absorbing, double *right, double *gram, double *plain, double *dense_plain, double *score,
@@ -332,7 +332,7 @@ INLINE void subtract_scores(double *const *to, int64_t count, int64_t width, con
 /* The scores of the tracks minus what the base does with them (second half of candidate_scores), in place.
  *
  * moved (rows, FIELDS): T B of each image around, in the order of joint_first's right.    track, scores: of joint_first. */
-WIDE int64_t joint_second(
+int64_t joint_second(
     const joint_model *m, int64_t num_around, const int32_t *own, const int64_t *around, const int64_t *start,
     const int32_t *track, const double *scores, const double *moved, double *track_score) {
     double unused[FIELDS] ALIGNED = {0.0}; /* where a track had this view already */
@@ -402,7 +402,7 @@ KERNEL int64_t joint_subtract_step(const joint_model *m, const double *moved, do
  *
  * facts: R (9), t (3) of cam_from_world, fx, fy, half width, half height, half of the larger one, height, R^-1 (9).
  * xyz (n, 3) world, predicted (n, 2) px. fisheye: u is theta (X, Y) / rho. power: of r^2 in the next term, 0 for none. */
-WIDE int64_t joint_fields(
+int64_t joint_fields(
     const joint_model *m, int64_t image, const double *facts, const double *xyz, const double *predicted, int64_t fisheye,
     int64_t power, double *scalar, double *dense) {
     int64_t first = m->offsets[image], n = m->offsets[image + 1] - first;

@@ -134,7 +134,7 @@ INLINE int64_t gram_of(
     return status;
 }
 
-WIDE KERNEL int64_t joint_common_gram(
+KERNEL int64_t joint_common_gram(
     int64_t halves, const joint_model *m, const seen_points *p, const common_fields *c, int64_t num_points, int64_t num, const
     int64_t *images, double *absorbed, double *gram, double *length, double *score, uint8_t *is_seen) {
     return halves == 1 ? gram_of(1, m, p, c, num_points, num, images, absorbed, gram, length, score, is_seen)
@@ -177,7 +177,7 @@ INLINE int64_t right_of(
     return status;
 }
 
-WIDE KERNEL int64_t joint_common_right(
+KERNEL int64_t joint_common_right(
     int64_t halves, const joint_model *m, const seen_points *p, const common_fields *c, const int64_t *is_own, const double
     *absorbed, double *right) {
     return halves == 1 ? right_of(1, m, p, c, is_own, absorbed, right)
@@ -216,7 +216,7 @@ INLINE int64_t tracks_of(
     return status;
 }
 
-WIDE KERNEL int64_t joint_common_tracks(
+KERNEL int64_t joint_common_tracks(
     int64_t halves, const joint_model *m, const seen_points *p, const common_fields *c, int64_t num_points, const int64_t
     *is_own, const double *moved, double *track_score) {
     return halves == 1 ? tracks_of(1, m, p, c, num_points, is_own, moved, track_score)

@@ -261,7 +261,7 @@ INLINE int64_t normal_of(
  * other_slabs (room, width, width): block between each of them (rows) and the image (columns), its own one halved; grams (num,
  * 2, width, width), rights (num, 2, width). Returns how many images were done; fewer than there are where the next one finds no
  * room, -1 without memory or where there are too many columns. */
-WIDE KERNEL int64_t joint_normals(
+KERNEL int64_t joint_normals(
     const joint_model *m, int64_t num, const int64_t *images, const double *transform, const double *plain,
     const double *other_inverse, const double *pull, const double *other_pull, int64_t room, int64_t *counts, int64_t *found,
     double *slabs, double *other_slabs, double *grams, double *rights) {
@@ -332,7 +332,7 @@ INLINE int64_t meat_of(
 
 /* Sums over tracks of s_k s^T, s the sum of w y~^T N over an image's views of a track (columns), s_k that of everybody behind it
  * (rows); its own one is halved (score_meat).    The rest as joint_normals has it. */
-WIDE KERNEL int64_t joint_meats(
+KERNEL int64_t joint_meats(
     const joint_model *m, int64_t num, const int64_t *images, const double *transform, int64_t room, int64_t *counts,
     int64_t *found, double *slabs) {
     int64_t used = 0, done = 0;

@@ -268,7 +268,7 @@ void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, in
  * of these images, of the views of their points, and of design and included fields around.    widest: most columns of one image.
  * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12): w E^T E, its diagonal; score (44); right,
  * solution (width, 44): R and B at its own columns, zero where it has none. */
-WIDE KERNEL int64_t joint_scores(
+KERNEL int64_t joint_scores(
     const joint_model *m, const base_inverse *s, const seen_points *p, int64_t num, const int64_t *images, const double *facts,
     const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t most_columns, int64_t widest, int64_t *status, int64_t *num_tracks,
     double *gram, double *meat, double *plain, double *dense_plain, double *score, double *right, double *solution) {

@@ -15,14 +15,6 @@
 #define KERNEL __attribute__((visibility("default")))
 #endif
 
-/* Wider registers where the processor has them. Products and sums are never fused (-ffp-contract=off) and no sum is
- * reordered by the compiler, so that both versions give the same bits. */
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(SFM_ONE_CLONE) /* musl has no ifunc */
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
-
 /* Ask for memory that is needed some steps later; at worst in vain. */
 #if defined(__GNUC__)
 #define SOON(address) __builtin_prefetch(address)

@@ -101,12 +101,12 @@ INLINE void stripes(const row_t *a, int rows, const row_t *b, int columns, lanes
     if (rows - r == 1) stripe(a + r, 1, b, upper * r, columns, sums + r * stride, stride);
 }
 
-static WIDE void products(const row_t *a, int rows, const row_t *b, int columns, lanes *sums, int64_t stride) {
+static void products(const row_t *a, int rows, const row_t *b, int columns, lanes *sums, int64_t stride) {
     stripes(a, rows, b, columns, sums, stride, 0);
 }
 
 /* The same where the first rows of b are those of a: what lies below the diagonal is not used. */
-static WIDE void upper_products(const row_t *a, int rows, int columns, lanes *sums, int64_t stride) {
+static void upper_products(const row_t *a, int rows, int columns, lanes *sums, int64_t stride) {
     stripes(a, rows, a, columns, sums, stride, 1);
 }
 
@@ -199,7 +199,7 @@ INLINE void fill_focals(block_t *b, int num_focals, const double *vx, const doub
 }
 
 /* All rows of the first ``count`` observations in b->rows. */
-static WIDE void evaluate(const model_t *model, const image_t *image, int count, block_t *b) {
+static void evaluate(const model_t *model, const image_t *image, int count, block_t *b) {
     const int64_t *facts = model->facts;
     const int q = own_columns(facts), num_rows = q + 1 + LENS + SHUTTER, first_extra = 6 + (int)facts[NUM_FOCALS];
     const double *lens = image->numbers + LENS_NUMBERS;
@@ -358,7 +358,7 @@ KERNEL int64_t sfm_misfit_sums(WINDOW, double *gram, double *on_y) {
 }
 
 /* w = (y - N c) / sqrt(1 - h) along x and y, h the squared length of the ``num`` rows of basis N. */
-static WIDE void weigh(const block_t *b, int q, const double *basis, int num, const double *c, scores_t *s) {
+static void weigh(const block_t *b, int q, const double *basis, int num, const double *c, scores_t *s) {
     int length[MAX_OWN]; /* of each row of the basis, zeros at its end left out */
     for (int i = 0; i < num; ++i)
         for (length[i] = q; length[i] > 0 && basis[i * q + length[i] - 1] == 0.0;) --length[i];
@@ -390,7 +390,7 @@ static WIDE void weigh(const block_t *b, int q, const double *basis, int num, co
 }
 
 /* Both rows of each feature times w. */
-static WIDE void fill_scores(const block_t *b, int q, scores_t *s) {
+static void fill_scores(const block_t *b, int q, scores_t *s) {
     const double *wx = s->w[0], *wy = s->w[1];
     for (int j = 0; j < q + LENS + SHUTTER; ++j) {
         const int from = j < q ? j : j + 1;
@@ -412,7 +412,7 @@ static void add_own(meat_t *meat, const row_t *g, int q) {
     upper_products(g + q + LENS, SHUTTER, SHUTTER, meat->shutter, SHUTTER);
 }
 
-static WIDE void fill_squares(const block_t *b, scores_t *s) {
+static void fill_squares(const block_t *b, scores_t *s) {
     const double *wx = s->w[0], *wy = s->w[1];
     for (int k = 0; k < SIZE; ++k)
         s->squares[0][k] = wx[k] * wx[k], s->squares[1][k] = wx[k] * wy[k], s->squares[2][k] = wy[k] * wy[k];
@@ -606,7 +606,7 @@ typedef struct {
     mixed_t mixed;
 } mixed_scratch_t;
 
-static WIDE void mix_fields(const block_t *b, int q, const double *mix, const double *coefficients, scores_t *s, mixed_t *out) {
+static void mix_fields(const block_t *b, int q, const double *mix, const double *coefficients, scores_t *s, mixed_t *out) {
     for (int axis = 0; axis < 2; ++axis) {
         const row_t *own = axis ? b->y : b->x;
         const double *factors = mix + axis * (MONOMIALS - 1) * SMOOTH;
@@ -709,7 +709,7 @@ KERNEL int64_t sfm_misfit_mixed(WINDOW, const double *basis, const double *on_y,
 }
 
 /* g minus what the profile explains of it: g_j -= sum_i coefficients (q, 40) of (N w)_i. */
-static WIDE void project_scores(scores_t *s, int q, const double *coefficients) {
+static void project_scores(scores_t *s, int q, const double *coefficients) {
     for (int k = 0; k < SIZE; k += 8)
         for (int j = 0; j < NUM_FEATURES; ++j) {
             lanes left = *(const lanes *)&s->g[q + j][k], right = *(const lanes *)&s->g[q + j][k + 4];
@@ -722,7 +722,7 @@ static WIDE void project_scores(scores_t *s, int q, const double *coefficients) 
 }
 
 /* Adds what the observations of a block say to the rows of their tracks, four features of four observations at a time. */
-static WIDE void add_to_tracks(const row_t *g, int count, double *const *track) {
+static void add_to_tracks(const row_t *g, int count, double *const *track) {
     for (int k = 0; k < count; k += 4)
         for (int j = 0; j < NUM_FEATURES; j += 4) {
             Lanes part[4];

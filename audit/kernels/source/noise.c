@@ -42,7 +42,7 @@ INLINE int constant_variance(int64_t n, const double *y, double kappa, double *t
 }
 
 /* theta (num_images,) of columns offsets[i] : offsets[i + 1] of residuals (2, n). */
-KERNEL WIDE int64_t constant_noises(int64_t num_images, int64_t n, const int64_t *offsets, const double *residuals,
+KERNEL int64_t constant_noises(int64_t num_images, int64_t n, const int64_t *offsets, const double *residuals,
                                     double kappa, double *theta, uint8_t *status)
 {
     int64_t most = 0;
@@ -424,7 +424,7 @@ INLINE int noise_of(Image *image, double out[NOISE_COLUMNS], uint8_t *outside)
 
 /* The noise of images under the noise model of tracks: z (rows, 2), where numpy is to transform what stands there, and
  * columns out. prior: nu0, s0. tables: (distinct dof, LAST_CELL + 1, 4) for x and for y given x. */
-KERNEL WIDE int64_t track_noises(int64_t num_images, int64_t n, const int64_t *offsets, const int64_t *verified_offsets,
+KERNEL int64_t track_noises(int64_t num_images, int64_t n, const int64_t *offsets, const int64_t *verified_offsets,
                                  const double *whitened, const uint8_t *verified, const double *other_sq,
                                  const int32_t *dof, const double *prior, double kappa, const int32_t *row_of_dof,
                                  const double *first, const double *second, double *z, uint8_t *outside, double *out,

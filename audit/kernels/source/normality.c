@@ -320,7 +320,7 @@ INLINE int statistics(int64_t n, const double *z, Room *room, double *out)
 }
 
 /* Statistics (num_images, COLUMNS) of the samples z[offsets[i] : offsets[i + 1]] of rows (x, y). */
-KERNEL WIDE int64_t normality_statistics(int64_t num_images, const int64_t *offsets, const double *z, const double *tails,
+KERNEL int64_t normality_statistics(int64_t num_images, const int64_t *offsets, const double *z, const double *tails,
                                          double *out, uint8_t *status)
 {
     int64_t most = 1;

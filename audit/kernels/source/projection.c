@@ -509,7 +509,7 @@ static void rotation_of(const double *q, double *r) {
     r[6] = 2 * (x * z - w * y), r[7] = 2 * (y * z + w * x), r[8] = 1 - 2 * (x * x + y * y);
 }
 
-WIDE static int project_image(const Scene *s, const Found *f, int64_t image, Block *b) {
+static int project_image(const Scene *s, const Found *f, int64_t image, Block *b) {
     const int64_t first = s->offsets[image], last = s->offsets[image + 1], camera = s->camera_idx[image];
     int64_t *counts = f->counts + NUM_COUNTS * image;
     memset(counts, 0, sizeof(int64_t) * NUM_COUNTS);

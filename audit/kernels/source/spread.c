@@ -23,7 +23,7 @@ static double turn(const Point *a, const Point *b, const Point *c)
 
 /* Points strictly inside of the polygon of the extreme points in eight directions, which are on no hull, are left out.
  * x, y: (n,) padded to a multiple of LANES. Returns how many are left in ``outer``. */
-WIDE static int64_t outside(const double *x, const double *y, int64_t n, Point *outer)
+static int64_t outside(const double *x, const double *y, int64_t n, Point *outer)
 {
     int64_t corner[CORNERS], num = 0;
     Lanes farthest[CORNERS];

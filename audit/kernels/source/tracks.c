@@ -176,7 +176,7 @@ enum { RUN = 256 * LANES }; /* 256 mantissas, each below 2, have a product in ra
  * (num_groups, 6).
  A sum of logarithms is that of a product whose factors' exponents are counted. Groups are filled up to
  * a multiple of LANES with q = 0 and c = 2^1000, which add nothing but exponents of 1000. */
-KERNEL WIDE int64_t prior_sums(int64_t num_groups, const int64_t *starts, const int64_t *counts, const double *sq,
+KERNEL int64_t prior_sums(int64_t num_groups, const int64_t *starts, const int64_t *counts, const double *sq,
                                const double *other_sq, double prior, double *out)
 {
     for (int64_t g = 0; g < num_groups; g++) {

@@ -198,7 +198,7 @@ typedef struct {
 
 /* Of the points first .. last that one image sees those that another should see, whose centre is ``apart`` from its own:
  * by the law of cosines. Returns how many. */
-WIDE static int64_t close_by(const Sights *sights, int64_t first, int64_t last, const double *apart, Alike alike,
+static int64_t close_by(const Sights *sights, int64_t first, int64_t last, const double *apart, Alike alike,
                              int32_t *found)
 {
     const double *x = sights->numbers, *y = x + sights->room, *z = y + sights->room, *length = z + sights->room;
