@@ -23,19 +23,20 @@ INLINE void crossed(
     pair_of_rows pair = {{0.0}, {0.0}};
     for (int64_t k = 0; k < num; k++, out += 2 * ROWS) {
         soon(m, view, k, num_left);
-        if (k + AHEAD < num_left) SOON(m->left + 2 * view[k + AHEAD]);
         const double *design = m->design + view[k] * 2 * m->width, *rows = rows_of(block, view[k]) + column;
-        const double *a = absorbing + 6 * own[k], *jx = design + 3, *jy = design + m->width + 3;
-        double w = m->weight[view[k]], itself = view[k] == first + own[k] ? w : 0.0;
+        const double *a = absorbing + 6 * own[k], *jx = design + 3, *jy = design + m->width + 3, *x = rows, *y = rows + block.width;
+        double w = m->weight[view[k]], itself = view[k] == first + own[k] ? w : 0.0, *score = scores + k * block.width + column;
+        double left_x = w * m->left[2 * view[k]], left_y = w * m->left[2 * view[k] + 1], last[ROWS];
         /* J A (2, 2): what moving the point by A does to this view */
         double xx = w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]) - itself, xy = w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
         double yx = w * (jy[0] * a[0] + jy[1] * a[2] + jy[2] * a[4]), yy = w * (jy[0] * a[1] + jy[1] * a[3] + jy[2] * a[5]) - itself;
-        if (count == ROWS) take_rows(rows, rows + block.width, ROWS, &pair);
-        else take_rows(rows, rows + block.width, count, &pair);
-        for (int c = 0; c < ROWS; c++) out[c] = pair.x[c] * xx + pair.y[c] * yx;
-        for (int c = 0; c < ROWS; c++) out[ROWS + c] = pair.x[c] * xy + pair.y[c] * yy;
-        double x = w * m->left[2 * view[k]], y = w * m->left[2 * view[k] + 1], *score = scores + k * block.width + column;
-        for (int64_t c = 0; c < count; c++) score[c] = pair.x[c] * x + pair.y[c] * y;
+        if (count < ROWS) take_rows(x, y, count, &pair), x = pair.x, y = pair.y;
+        for (int c = 0; c < ROWS; c += LANES) {
+            wide of_x = LOAD(x + c), of_y = LOAD(y + c);
+            STORE(out + c) = of_x * xx + of_y * yx, STORE(out + ROWS + c) = of_x * xy + of_y * yy;
+            STORE((count < ROWS ? last : score) + c) = of_x * left_x + of_y * left_y;
+        }
+        for (int64_t c = 0; count < ROWS && c < count; c++) score[c] = last[c];
     }
 }
 

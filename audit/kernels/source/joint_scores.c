@@ -2,7 +2,7 @@
  * section 11b; audit/joint/image_scores.py). */
 #include "joint.h"
 
-enum { TILE = 16, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64, LINE = 8 };
+enum { TILE = 16, RUN = 8, VECTORS = FIELDS / LANES, TRACKS_AT_ONCE = 64, LINE = 8 };
 
 /* S^+ (size, size) of the base: dense, or of a band by places, D^-1 (Y - A B^T - B A^T) D^-1 (audit/joint/banded.py). */
 typedef struct {
@@ -36,9 +36,12 @@ INLINE void add_row(double *out, double x, const double *from) {
     for (int v = 0; v < VECTORS; v++) STORE(out + LANES * v) += f * LOAD(from + LANES * v);
 }
 
-/* Entries of Y at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. */
+/* Entries of Y at places key[first_row ..] and key[first_column ..], at or right of the diagonal; 0 where not at hand. Columns of an
+ * image mostly follow each other. */
 INLINE int entries_of(
     const base_inverse *s, const keyed *key, int64_t first_row, int64_t rows, int64_t first_column, int64_t columns, double *out) {
+    int64_t at[TILE];
+    for (int64_t j = 0; j < columns; j++) at[j] = key[first_column + j].key;
     for (int64_t i = 0; i < rows; i++) {
         int64_t place = key[first_row + i].key, origin = 0;
         const double *row;
@@ -47,12 +50,15 @@ INLINE int entries_of(
         } else {
             int64_t block = s->block[place];
             origin = s->first[block];
-            if (key[first_column + columns - 1].key - origin >= s->block_columns[block]) return 0;
+            if (at[columns - 1] - origin >= s->block_columns[block]) return 0;
             row = s->near + s->starts[block] + (place - origin) * s->block_columns[block];
         }
-        for (int64_t j = 0; j < columns; j++) {
-            int64_t other = key[first_column + j].key;
-            out[TILE * i + j] = other >= place ? row[other - origin] : 0.0;
+        for (int64_t j = 0; j < columns; j += RUN) {
+            if (at[j] >= place && j + RUN <= columns && at[j + RUN - 1] - at[j] == RUN - 1) {
+                for (int l = 0; l < RUN; l += LANES) STORE(out + TILE * i + j + l) = LOAD(row + at[j] - origin + l);
+                continue;
+            }
+            for (int64_t l = j; l < columns && l < j + RUN; l++) out[TILE * i + l] = at[l] >= place ? row[at[l] - origin] : 0.0;
         }
     }
     return 1;
@@ -256,6 +262,12 @@ INLINE void spread_columns(const joint_model *m, const base_inverse *s, const wo
 void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, int64_t n, double *xyz, double *predicted) {
     for (int64_t i = 0; i < n; i++) {
         int64_t source = p->source[first + i];
+        if (i + 2 * AHEAD < n) SOON(p->points + m->point_idx[first + i + 2 * AHEAD]);
+        if (i + AHEAD < n) {
+            int64_t later = p->source[first + i + AHEAD];
+            SOON(p->xyz + 3 * p->points[m->point_idx[first + i + AHEAD]]), SOON(p->observed + 2 * p->observation_row[later]);
+            SOON(p->residuals + later), SOON(p->residuals + p->num_residuals + later);
+        }
         const double *from = p->xyz + 3 * p->points[m->point_idx[first + i]], *xy = p->observed + 2 * p->observation_row[source];
         for (int axis = 0; axis < 3; axis++) xyz[3 * i + axis] = from[axis];
         for (int axis = 0; axis < 2; axis++) predicted[2 * i + axis] = xy[axis] - p->residuals[axis * p->num_residuals + source];
