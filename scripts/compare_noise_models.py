@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.config import AuditConfig
+from sfm_audit.audit.inliers.distortion import DistortionDerivatives
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.noise.fits import fit_constant_variance, fit_variance
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks, scale_only_noise
@@ -242,7 +243,7 @@ def simulated(gamma: float, rng: np.random.Generator) -> tuple[ModelResiduals, i
         noise,
         jacobian,
         np.zeros(num_images),
-        (),
+        DistortionDerivatives({}),
         empty,
         empty,
         empty,

@@ -39,7 +39,7 @@ def joined_inliers(
         residuals.residuals_px[:, columns],
         np.asfortranarray(moved(quats.repeat(num_each, 0).T, translations.repeat(num_each, 0).T, xyz_world)),
         _in_camera(quats, residuals.point_jacobian[:, :, columns]),
-        np.concatenate([residuals.d_extra[i] for i in image_idxs], axis=2),
+        np.concatenate(residuals.d_extra.of(image_idxs), axis=2),
     )
 
 

@@ -28,7 +28,9 @@ class Kept:
 
     Attributes
     ----------
+    scene : as `project_scene` got it
     missing : (m,) images that are to be `put` here
+    d_extra : of the images that were put here, (e, 2, n) derivatives in the distortion
     unsure : (u,) images that are here without their pose's offset
     pose_offset_px : (I,) NaN where it is not known
     pose_sums : (I, 6, 6) and (I, 6), see `stationarity.offsets_of_sums`; None where not all images have them
@@ -40,12 +42,13 @@ class Kept:
             raise ValueError(f"expected fewer than 2^31 observations, found {capacity}")
         self._first = model.observations.offsets
         self.pose_offset_px: FloatArray = np.full(num_images, np.nan)
-        self._extra: list[FloatArray] = [np.empty((0, 2, 0))] * num_images
+        self.d_extra: dict[int, FloatArray] = {}
         self._counts = np.zeros((_NUM_COUNTS, num_images), dtype=np.int64)
         self.missing: IntArray = np.arange(num_images)
         self.unsure: IntArray = np.empty(0, dtype=np.int64)
         self.pose_sums: tuple[FloatArray, FloatArray] | None = None
-        found = project_scene(scene_of(model))
+        self.scene = scene_of(model)
+        found = project_scene(self.scene)
         if found is None:
             self.rows: Int32Array = np.empty(capacity, dtype=np.int32)
             self.residuals_px, self.point_jacobian = np.empty((2, capacity)), np.empty((2, 3, capacity))
@@ -66,12 +69,6 @@ class Kept:
         self.missing = np.flatnonzero(~found.done)
         self.pose_sums = (found.pose_gram, found.pose_right) if found.done.all() else None
         num = counts[_INLIERS]
-        where = zip(found.extra_offsets.tolist(), num.tolist(), found.num_extra.tolist(), strict=False)
-        for image_idx, (at, count, size) in enumerate(where):
-            if size and count and found.done[image_idx]:
-                self._extra[image_idx] = found.extra[at : at + 2 * size * count].reshape(size, 2, count)
-            else:
-                self._extra[image_idx] = np.empty((0, 2, count))
         offsets, is_sure = offsets_of_sums(found.pose_gram, found.pose_right, num)
         self.pose_offset_px[:] = np.where(found.done & is_sure, offsets, np.nan)
         self.unsure = np.flatnonzero(found.done & ~is_sure & (num > 0))
@@ -83,7 +80,7 @@ class Kept:
         self.point_jacobian[:, :, found.rows] = found.point_jacobian
         images, num = found.images, np.diff(found.offsets)
         for image_idx, start, count in zip(images.tolist(), found.offsets.tolist(), num.tolist(), strict=False):
-            self._extra[image_idx] = found.d_extra[:, :, start : start + count]
+            self.d_extra[image_idx] = found.d_extra[:, :, start : start + count]
         self._counts[_INLIERS, images] = num
         offsets, is_sure = offsets_of_sums(found.pose_gram, found.pose_right, num)
         self.pose_offset_px[images] = np.where(is_sure, offsets, np.nan)
@@ -103,17 +100,12 @@ class Kept:
         self.rows[own] = inlier_row + first
         self.residuals_px[:, own] = residuals_px
         self.point_jacobian[:, :, own] = point_jacobian
-        self._extra[image_idx] = d_extra
+        self.d_extra[image_idx] = d_extra
         self._counts[_INLIERS, image_idx] = inlier_row.size
 
     def count(self, image_idx: int, *, dangling: int, behind: int, nonfinite: int, unprojected: int) -> None:
         """Keep how many linked observations are no inliers, by cause."""
         self._counts[_DANGLING:, image_idx] = dangling, behind, nonfinite, unprojected
-
-    @property
-    def d_extra(self) -> tuple[FloatArray, ...]:
-        """By image, (e, 2, n) derivatives in the distortion."""
-        return tuple(self._extra)
 
     @property
     def others(self) -> IntArray:

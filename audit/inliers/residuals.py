@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from sfm_audit.audit.cameras import project_columns
+from sfm_audit.audit.inliers.distortion import DistortionDerivatives, Projectable
 from sfm_audit.audit.inliers.frames import claimed_frames, frame_offsets_px
 from sfm_audit.audit.inliers.kept import Kept
 from sfm_audit.audit.inliers.sanity import (
@@ -61,7 +62,7 @@ class ModelResiduals:
     point_idx: (n,) rows of PointTable.                                  residuals_px: (2, n) observed - projected.
     point_jacobian: (2, 3, n) px per model unit, world frame.            pose_offset_px: (I,) NaN without inliers;
     of the whole frame where the model claims frames of several images.
-    d_extra: per image, (e, 2, n_i) d projection / d distortion parameters, px per unit. With them everything else that
+    d_extra: by image, (e, 2, n_i) d projection / d distortion parameters, px per unit. With them everything else that
     a projection gives is cheap to have again: `audit.inliers.projected.image_inliers`.
     num_dangling, num_behind, num_nonfinite: (I,) linked observations that are no inliers, by cause.
     num_unprojected: (I,) of num_nonfinite, those in front of their camera that have no finite projection.
@@ -73,7 +74,7 @@ class ModelResiduals:
     residuals_px: FloatArray
     point_jacobian: FloatArray
     pose_offset_px: FloatArray
-    d_extra: tuple[FloatArray, ...]
+    d_extra: DistortionDerivatives
     num_dangling: IntArray
     num_behind: IntArray
     num_nonfinite: IntArray
@@ -246,7 +247,7 @@ def model_residuals(model: SparseModel) -> ModelResiduals:
         kept.residuals_px,
         kept.point_jacobian,
         pose_offset,
-        kept.d_extra,
+        DistortionDerivatives(kept.d_extra, Projectable(model, kept.scene, offsets, point_idx), len(model.images)),
         *kept.others,
     )
 

@@ -41,6 +41,7 @@ NUM_PARAMS: Final = 16
 NUM_POSE: Final = 6
 NUM_SUMS: Final = 27
 NUM_COUNTS: Final = 3
+_MOST_LOOKED_AT: Final = 2  # times the inliers of images that are looked at together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +70,6 @@ class Projected:
     """Inliers of each image from its first observation on; what lies between two images' is undefined.
 
     rows: (M,) rows of the observations.    residuals_px: (2, M).    point_jacobian: (2, 3, M) world frame.
-    extra: flat, (e, 2, n) of each image from extra_offsets (I + 1,) on; num_extra: (I,) e.
     counts: (I, 3) inliers, dangling, behind.    done: (I,) whether the image is here at all.
     pose_gram: (I, 6, 6) products of the columns of each pose.    pose_right: (I, 6) of these and the residuals.
     """
@@ -77,9 +77,6 @@ class Projected:
     rows: Int32Array
     residuals_px: FloatArray
     point_jacobian: FloatArray
-    extra: FloatArray
-    extra_offsets: IntArray
-    num_extra: IntArray
     counts: IntArray
     pose_gram: FloatArray
     pose_right: FloatArray
@@ -97,27 +94,77 @@ def project_scene(scene: Scene) -> Projected | None:
     function = kernel(
         "sfm_project",
         *(Size, Size, Ints, SmallInts, Doubles, Doubles, Doubles, Doubles, Ints, Ints, Doubles),
-        *(Size, SmallInts, Doubles, Doubles, Ints, Doubles, Ints, Doubles, Ints),
+        *(Size, SmallInts, Doubles, Doubles, Ints, Doubles, Ints),
     )
     if function is None:
         return None
     _check(scene)
     num_images, capacity = len(scene.camera_idx), len(scene.point_idx)
     num_linked = np.diff(scene.offsets)
-    num_extra = np.where(scene.camera_idx < 0, 0, np.append(scene.lenses[:, 2], 0)[scene.camera_idx])
-    extra_offsets = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(2 * num_extra * num_linked)])
     rows, status = np.empty(capacity, dtype=np.int32), np.empty(num_images, dtype=np.int64)
     residuals, jacobian = np.empty((2, capacity)), np.empty((2, 3, capacity))
-    extra, counts = np.empty(int(extra_offsets[-1])), np.zeros((num_images, NUM_COUNTS), dtype=np.int64)
-    sums = np.zeros((num_images, NUM_SUMS))
+    counts, sums = np.zeros((num_images, NUM_COUNTS), dtype=np.int64), np.zeros((num_images, NUM_SUMS))
     arrays = (
         *(scene.offsets, scene.point_idx, scene.xy_px, scene.xyz_world, scene.quaternions, scene.translations),
         *(scene.camera_idx, scene.lenses, scene.params),
-        *(capacity, rows, residuals, jacobian, extra_offsets, extra, counts, sums, status),
+        *(capacity, rows, residuals, jacobian, counts, sums, status),
     )
     over_ranges(lambda start, stop: function(start, stop, *arrays), num_images, num_linked)
     gram, right = _unpacked(sums)
-    return Projected(rows, residuals, jacobian, extra, extra_offsets, num_extra, counts, gram, right, status == 0)
+    return Projected(rows, residuals, jacobian, counts, gram, right, status == 0)
+
+
+def distortion_derivatives(
+    scene: Scene, offsets: IntArray, point_idx: Int32Array, image_idxs: IntArray
+) -> list[FloatArray] | None:
+    """Return (e, 2, n) d projection / d distortion of the inliers of some images, px per unit; None for the numpy path.
+
+    Those of images beside each other in ``image_idxs`` are beside each other in memory. (0, 2, 0) without inliers.
+
+    Parameters
+    ----------
+    offsets, point_idx : (I + 1,), (n,) the inliers of all images; a point of the scene each
+    image_idxs : (k,) images that `project_scene` has done
+
+    Raises
+    ------
+    IndexError
+        where an image has no lens, or an index or an offset does not fit its table.
+    """
+    types = (Size, Ints, Ints, SmallInts, Doubles, Doubles, Doubles, Ints, Ints, Doubles, Ints, Doubles)
+    function = kernel("sfm_distortion", *types)
+    if function is None:
+        return None
+    camera_idx = scene.camera_idx
+    _check_inliers(scene, offsets, point_idx, image_idxs)
+    num, num_extra = offsets[image_idxs + 1] - offsets[image_idxs], scene.lenses[camera_idx[image_idxs], 2]
+    ends = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(2 * num_extra * num)])
+    extra = np.empty(int(ends[-1]))
+    arrays = scene.xyz_world, scene.quaternions, scene.translations, camera_idx, scene.lenses, scene.params
+    if function(len(num), image_idxs, offsets, point_idx, *arrays, ends[:-1].copy(), extra):
+        return None
+    shapes = zip(ends.tolist(), ends[1:].tolist(), num_extra.tolist(), num.tolist(), strict=False)
+    return [extra[start:stop].reshape(size if count else 0, 2, count) for start, stop, size, count in shapes]
+
+
+def _check_inliers(scene: Scene, offsets: IntArray, point_idx: Int32Array, image_idxs: IntArray) -> None:
+    """Every index that C follows for these images lies within its table; what `_check` has seen is not looked at."""
+    num_images = len(scene.camera_idx)
+    if offsets.shape != (num_images + 1,) or not image_idxs.size:
+        raise IndexError("expected images, and offsets of all images")
+    if not 0 <= image_idxs.min() <= image_idxs.max() < num_images or scene.camera_idx[image_idxs].min() < 0:
+        raise IndexError("an image is not there, or has no camera")
+    if scene.lenses[scene.camera_idx[image_idxs], 0].min() < 0:
+        raise IndexError("an image has no lens that is compiled")
+    first, last = offsets[image_idxs], offsets[image_idxs + 1]
+    if not (first.min() >= 0 and (first <= last).all() and last.max() <= len(point_idx)):
+        raise IndexError("an offset of the inliers points outside of their table")
+    together = last.max() - first.min() <= _MOST_LOOKED_AT * (last - first).sum()
+    parts = [(first.min(), last.max())] if together else zip(first, last, strict=True)
+    for start, stop in parts:
+        own = point_idx[start:stop]
+        if own.size and not 0 <= own.min() <= own.max() < len(scene.xyz_world):
+            raise IndexError("an inlier is of a point that is not there")
 
 
 def _unpacked(sums: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -220,6 +220,7 @@ def _meat(
             lowest, highest = first.tracks.reach[own].T
             if ((lowest < tracks.last) & (highest >= tracks.first)).any():
                 window.add_tracks(per_track, (basis[own], on_y[own], coefficients[own]), tracks)
+                window.forget()  # most images are met once
             at = own.stop
         meat += per_track.T @ per_track
         if mixed is not None:

@@ -217,7 +217,7 @@ class ModelSums:
         numbers[:, 7:16] = cams_from_gradients(quats).reshape(-1, 9)
         numbers[:, 16:] = [_lens_numbers(camera) for camera in cameras]
         rows = np.stack([offsets[chosen], offsets[chosen + 1]], axis=1).astype(np.int64)
-        extra = tuple(self.residuals.d_extra[image] for image in images)
+        extra = self.residuals.d_extra.of(images)
         return Window(np.ascontiguousarray(rows), numbers, _facts(cameras[0].model), extra)
 
 
@@ -339,6 +339,10 @@ class WindowSums:
 
     def _clusters(self, b: int) -> Clusters | None:
         return Clusters.of(pixels(self._source.keypoints(self.images[b])))
+
+    def forget(self) -> None:
+        """Let go of what kernels take of the images: it is made again when it is asked for."""
+        self.__dict__.pop("_window", None)
 
     def add_tracks(
         self, per_track: FloatArray, profile: tuple[FloatArray, FloatArray, FloatArray], tracks: Tracks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,8 @@ from scipy.special import hyp2f1
 from sfm_audit.audit.inliers import kept
 from sfm_audit.audit.inliers.residuals import image_residuals, model_residuals
 from sfm_audit.audit.inliers.stationarity import offset_px, offsets_of_sums
-from sfm_audit.audit.kernels import kernels_in_use
-from sfm_audit.audit.kernels.projection import LENSES, project_scene
+from sfm_audit.audit.kernels import kernels_in_use, numpy_only
+from sfm_audit.audit.kernels.projection import LENSES, distortion_derivatives, project_scene
 from sfm_audit.loaders.camera_models import CAMERA_MODELS
 from sfm_audit.loaders.model import PointTable
 
@@ -121,6 +122,64 @@ def test_indices_that_point_outside_are_refused(table, field, value):
     scene = kept.scene_of(replace(model, **{table: replace(getattr(model, table), **{field: array})}))
     with pytest.raises(IndexError):
         project_scene(scene)
+
+
+@pytest.mark.parametrize("name", sorted(set(LENSES) & set(NAMES)))
+def test_derivatives_in_the_distortion_are_made_again_by_either_path(name):
+    model = model_with(name, sizes=(20, 300, 0, 140, 33, 1))
+    point_idx = model.observations.point_idx.copy()
+    point_idx[[0, 21, 400]] = -1
+    residuals = model_residuals(replace(model, observations=replace(model.observations, point_idx=point_idx)))
+    made = residuals.d_extra
+    found = [made[image] for image in (5, 3, 0, 2, 1)]
+    together = made.of([5, 3, 0, 2, 1])
+    unpickled = pickle.loads(pickle.dumps(residuals)).d_extra  # noqa: S301 - its own
+    with numpy_only():
+        by_numpy = unpickled.of([5, 3, 0, 2, 1])
+    for image, one, other, expected in zip((5, 3, 0, 2, 1), found, together, by_numpy, strict=True):
+        rows = residuals.rows(image)
+        num_extra = len(model.camera(int(model.images.camera_idx[image])).model.extra_idxs)
+        assert one.shape == (num_extra if rows.stop > rows.start else 0, 2, rows.stop - rows.start)
+        assert_array_equal(one, other)
+        assert one.shape == expected.shape
+        assert_allclose(one, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max(initial=1.0))
+
+
+def test_derivatives_in_the_distortion_of_images_that_numpy_projected_are_kept():
+    model = model_with("OPENCV", sizes=(20, 30, 10))
+    images = replace(model.images, camera_idx=np.array([0, -1, 2]))
+    made = model_residuals(replace(model, images=images)).d_extra
+    assert [each.shape for each in made] == [(4, 2, 20), (0, 2, 0), (4, 2, 10)]
+    assert [each.shape for each in made.of([1, 2])] == [(0, 2, 0), (4, 2, 10)]
+    for image in (-1, 3):
+        with pytest.raises(IndexError, match="no image in row"):
+            made[image]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image_idxs": np.array([2])}, "not there"),
+        ({"image_idxs": np.array([-1])}, "not there"),
+        ({"image_idxs": np.array([], dtype=np.int64)}, "expected images"),
+        ({"offsets": np.array([0, 5])}, "expected images"),
+        ({"offsets": np.array([0, 5, 11])}, "offset"),
+        ({"offsets": np.array([6, 5, 10])}, "offset"),
+        ({"point_idx": np.full(10, 11, dtype=np.int32)}, "a point that is not there"),
+        ({"point_idx": np.full(10, -1, dtype=np.int32)}, "a point that is not there"),
+    ],
+)
+def test_inliers_that_are_not_there_are_no_memory(change, message):
+    model = model_with("OPENCV", sizes=(5, 5))
+    residuals = model_residuals(model)
+    given = {"offsets": residuals.offsets, "point_idx": residuals.point_idx, "image_idxs": np.array([0, 1])}
+    scene = kept.scene_of(model)
+    assert [each.shape for each in distortion_derivatives(scene, *given.values())] == [(4, 2, 5)] * 2
+    with pytest.raises(IndexError, match=message):
+        distortion_derivatives(scene, *{**given, **change}.values())
+    for odd in (replace(scene, camera_idx=np.array([0, -1])), replace(scene, lenses=scene.lenses - [[0], [99]])):
+        with pytest.raises(IndexError, match=r"no camera|no lens"):
+            distortion_derivatives(odd, *given.values())
 
 
 def test_the_arctangent_of_the_kernel_is_that_of_a_series_of_gauss():

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import integrate, stats
 
+from sfm_audit.audit.inliers.distortion import DistortionDerivatives
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.noise.keypoint import fit_scale_power, keypoint_noise, keypoint_tracks, scale_only_noise
 from sfm_audit.audit.noise.standardise import model_tracks, track_noise
@@ -42,7 +43,7 @@ def simulate(rng, gamma, *, num_images=6, num_points=600, nu0=4.0, spread=0.6, c
         noise,
         jacobian,
         np.zeros(num_images),
-        (),
+        DistortionDerivatives({}),
         none,
         none,
         none,

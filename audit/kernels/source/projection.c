@@ -1,4 +1,4 @@
-/* Residuals of all observations of a model, with derivatives in the point, the pose and the distortion.
+/* Residuals of all observations of a model, with derivatives in the point and the pose; those in the distortion.
  *
  * Twins: sfm_audit.audit.inliers.residuals and sfm_audit.audit.cameras, whose formulas these are, in their order. A
  * block of points goes from step to step in arrays of its own (structure of arrays, in the first cache): points into
@@ -338,8 +338,7 @@ typedef struct {
 
 typedef struct {
     int64_t capacity;
-    double *residuals, *jacobian, *extra, *pose_sums;
-    const int64_t *extra_offsets;
+    double *residuals, *jacobian, *pose_sums;
     int32_t *rows;
     int64_t *counts;
 } Found;
@@ -351,7 +350,7 @@ typedef struct {
 } Sums;
 
 /* Points into the camera frame, in Eigen's order of operations (loaders.model.moved); rows from `first` on. */
-INLINE void gather(Block *b, const Scene *s, int64_t image, int64_t first, int n) {
+INLINE void place(Block *b, const Scene *s, int64_t image, int64_t first, int n) {
     const double *q = s->quaternions + 4 * image, *t = s->translations + 3 * image;
     const double w = q[0], qx = q[1], qy = q[2], qz = q[3];
     const int64_t last = s->offsets[image + 1];
@@ -373,6 +372,12 @@ INLINE void gather(Block *b, const Scene *s, int64_t image, int64_t first, int n
         b->x[k] = x[k] + w * ux + (qy * uz - qz * uy) + t[0];
         b->y[k] = y[k] + w * uy + (qz * ux - qx * uz) + t[1];
         b->z[k] = z[k] + w * uz + (qx * uy - qy * ux) + t[2];
+    }
+}
+
+INLINE void gather(Block *b, const Scene *s, int64_t image, int64_t first, int n) {
+    place(b, s, image, first, n);
+    EACH(k, b) {
         b->seen_x[k] = s->xy_px[2 * (first + k)];
         b->seen_y[k] = s->xy_px[2 * (first + k) + 1];
     }
@@ -405,8 +410,8 @@ INLINE void keep_candidates(Block *b, const Scene *s, int64_t *counts) {
     b->n = kept;
 }
 
-INLINE void project(Block *b, const int64_t *lens, const double *params) {
-    const double fx = params[0], fy = params[1], cx = params[2], cy = params[3], *extra = params + 4;
+/* Through the lens, with derivatives in its parameters and, where wanted, in the point. */
+INLINE void bend(Block *b, const int64_t *lens, const double *extra, const int with_point) {
     if (lens[LENS] == DIVISION) {
         division(b, extra);
     } else if (lens[LENS] == EUCM) {
@@ -414,12 +419,19 @@ INLINE void project(Block *b, const int64_t *lens, const double *params) {
     } else if (lens[IS_FISHEYE]) {
         equidistant(b);
         distort(b, (int)lens[LENS], extra, (int)lens[NUM_EXTRA]);
-        bend_equidistant(b);
+        if (with_point)
+            bend_equidistant(b);
     } else {
         perspective(b);
         distort(b, (int)lens[LENS], extra, (int)lens[NUM_EXTRA]);
-        bend_perspective(b);
+        if (with_point)
+            bend_perspective(b);
     }
+}
+
+INLINE void project(Block *b, const int64_t *lens, const double *params) {
+    const double fx = params[0], fy = params[1], cx = params[2], cy = params[3];
+    bend(b, lens, params + 4, 1);
     EACH(k, b) {
         b->residual[0][k] = b->seen_x[k] - (b->wx[k] * fx + cx);
         b->residual[1][k] = b->seen_y[k] - (b->wy[k] * fy + cy);
@@ -480,7 +492,7 @@ INLINE void add_largest(const Block *b, Sums *sums) {
     sums->residual = residual, sums->derivative = derivative, sums->distance = distance;
 }
 
-/* Residuals, derivatives in the point in the world frame (J R), and in the distortion, behind what is there. */
+/* Residuals and derivatives in the point in the world frame (J R), behind what is there. */
 INLINE void store(const Block *b, const Found *f, const double *rotation, int64_t at) {
     EACH(k, b) f->rows[at + k] = (int32_t)b->row[k];
     for (int axis = 0; axis < 2; axis++) {
@@ -517,7 +529,7 @@ static int project_image(const Scene *s, const Found *f, int64_t image, Block *b
         return NEEDS_NUMPY;
     const int64_t *lens = s->lenses + NUM_LENS * camera;
     const double *params = s->params + NUM_PARAMS * camera;
-    double rotation[9], *extra = f->extra + f->extra_offsets[image];
+    double rotation[9];
     Sums sums = {{{0.0}}, 0, 0, 0};
     rotation_of(s->quaternions + 4 * image, rotation);
     int64_t num = 0;
@@ -528,14 +540,11 @@ static int project_image(const Scene *s, const Found *f, int64_t image, Block *b
         add_pose(b, &sums);
         add_largest(b, &sums);
         store(b, f, rotation, first + num);
-        store_extra(b, extra + num, last - first, lens[NUM_EXTRA], params);
         num += b->n;
     }
     if (!(number(sums.residual) <= MAX_RESIDUAL_PX) || !(number(sums.derivative) <= MAX_DERIVATIVE) ||
         !(number(sums.derivative) * number(sums.distance) <= MAX_MAGNITUDE))
         return NEEDS_NUMPY;
-    for (int64_t i = 1; num < last - first && i < 2 * lens[NUM_EXTRA]; i++)
-        memmove(extra + i * num, extra + i * (last - first), sizeof(double) * (size_t)num);
     for (int i = 0; i < NUM_SUMS; i++)
         f->pose_sums[NUM_SUMS * image + i] =
             (sums.lanes[i][0] + sums.lanes[i][1]) + (sums.lanes[i][2] + sums.lanes[i][3]);
@@ -548,17 +557,15 @@ static int project_image(const Scene *s, const Found *f, int64_t image, Block *b
  * offsets (I + 1), point_idx (M), xy_px (M, 2): the observations by image. xyz_world (P, 3). quaternions (I, 4),
  * translations (I, 3), camera_idx (I). lenses (C, 3): lens (-1: not here), is_fisheye, num_extra. params (C, 16): fx fy
  * cx cy, then the distortion. Out, the inliers of an image from its first observation on: rows (M), residuals (2, M),
- * jacobian (2, 3, M) in the world frame; extra: (e, 2, n) of each image from extra_offsets on; counts (I, 3): inliers,
- * dangling, behind; pose_sums (I, 27): for each of six pose columns its products with it and those behind it, then with
- * the residuals; status (I). Returns how many images are left to numpy. */
+ * jacobian (2, 3, M) in the world frame; counts (I, 3): inliers, dangling, behind; pose_sums (I, 27): for each of six
+ * pose columns its products with it and those behind it, then with the residuals; status (I). Returns how many images are left to numpy. */
 KERNEL int64_t sfm_project(int64_t first, int64_t last, const int64_t *offsets, const int32_t *point_idx,
                            const double *xy_px, const double *xyz_world, const double *quaternions,
                            const double *translations, const int64_t *camera_idx, const int64_t *lenses,
                            const double *params, int64_t capacity, int32_t *rows, double *residuals, double *jacobian,
-                           const int64_t *extra_offsets, double *extra, int64_t *counts, double *pose_sums,
-                           int64_t *status) {
+                           int64_t *counts, double *pose_sums, int64_t *status) {
     const Scene scene = {offsets, camera_idx, lenses, point_idx, xy_px, xyz_world, quaternions, translations, params};
-    const Found found = {capacity, residuals, jacobian, extra, pose_sums, extra_offsets, rows, counts};
+    const Found found = {capacity, residuals, jacobian, pose_sums, rows, counts};
     int64_t num_left = 0;
     Block *block = calloc(1, sizeof *block);
     for (int64_t image = first; image < last; image++) {
@@ -567,4 +574,29 @@ KERNEL int64_t sfm_project(int64_t first, int64_t last, const int64_t *offsets, 
     }
     free(block);
     return num_left;
+}
+
+static void distortion_of(const Scene *s, int64_t image, Block *b, double *extra) {
+    const int64_t first = s->offsets[image], last = s->offsets[image + 1];
+    const int64_t *lens = s->lenses + NUM_LENS * s->camera_idx[image];
+    const double *params = s->params + NUM_PARAMS * s->camera_idx[image];
+    for (int64_t row = first; row < last; row += BLOCK) {
+        place(b, s, image, row, (int)(last - row < BLOCK ? last - row : BLOCK));
+        bend(b, lens, params + 4, 0);
+        store_extra(b, extra + (row - first), last - first, lens[NUM_EXTRA], params);
+    }
+}
+
+/* Derivatives in the distortion of the inliers of some images (num,), all of which have a lens of this file: (e, 2, n)
+ * of each from extra_offsets (num,) on. Inputs as of sfm_project, but offsets and point_idx are those of the inliers. */
+KERNEL int64_t sfm_distortion(int64_t num, const int64_t *images, const int64_t *offsets, const int32_t *point_idx,
+                              const double *xyz_world, const double *quaternions, const double *translations,
+                              const int64_t *camera_idx, const int64_t *lenses, const double *params,
+                              const int64_t *extra_offsets, double *extra) {
+    const Scene scene = {offsets, camera_idx, lenses, point_idx, NULL, xyz_world, quaternions, translations, params};
+    Block *block = calloc(1, sizeof *block);
+    for (int64_t i = 0; block != NULL && i < num; i++)
+        distortion_of(&scene, images[i], block, extra + extra_offsets[i]);
+    free(block);
+    return block == NULL ? NO_MEMORY : DONE;
 }
