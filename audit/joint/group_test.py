@@ -14,12 +14,12 @@ from scipy import special
 
 from sfm_audit.audit.joint.candidates import CandidateScores
 from sfm_audit.audit.table.words import MisfitStatus
-from sfm_audit.loaders.arrays import BoolArray, FloatArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 KEPT_EIGENVALUE: Final = 1e-4  # of K with unit columns: below it, base and points absorb the direction
 MIN_OBSERVATIONS_PER_RANK: Final = 4
 MAX_EFFECT_OVER_RMS: Final = 1.5  # method.md section 10d (b)
-_SINGULAR_MEAT: Final = 1e-12
+SINGULAR_MEAT: Final = 1e-12
 
 
 class GroupTest(NamedTuple):
@@ -87,33 +87,59 @@ def _judged(
     rms_px: FloatArray,
 ) -> list[GroupTest]:
     roots, kept = directions
-    finite = [bool(np.isfinite(each.gram[own, own]).all()) for each in scores]
-    n = np.array([each.num_observations for each in scores])
-    clusters, ranks = np.minimum([each.num_tracks for each in scores], n), kept.sum(axis=1)
+    finite = np.array([np.isfinite(each.gram[own, own]).all() for each in scores])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is not tested
         z = np.einsum("brc,bc->br", roots, np.stack([each.score[own] for each in scores]))
         spread = roots @ np.stack([each.meat[own, own] for each in scores]) @ roots.swapaxes(1, 2)
         statistic = _quadratic_forms(z, spread, kept)
+        gain = (z * z).sum(axis=1) - np.einsum("brr->b", spread)
+    numbers = GroupSums(statistic, gain, kept.sum(axis=1), finite)
+    num_tracks = np.array([each.num_tracks for each in scores])
+    num_observations = np.array([each.num_observations for each in scores])
+    return answers(numbers, num_tracks, num_observations, sigma_px, rms_px)
+
+
+class GroupSums(NamedTuple):
+    """Of b groups (b,): T, NaN where its matrix is singular; |z|^2 - tr M; r; whether K is finite."""
+
+    statistic: FloatArray
+    gain: FloatArray
+    rank: IntArray
+    finite: BoolArray
+
+
+def answers(
+    sums: GroupSums, num_tracks: IntArray, num_observations: IntArray, sigma_px: FloatArray, rms_px: FloatArray
+) -> list[GroupTest]:
+    """Return what b groups say.
+
+    Parameters
+    ----------
+    num_tracks, num_observations, sigma_px, rms_px : (b,) of the image of each
+    """
+    statistic, gain, ranks, finite = sums
+    clusters = np.minimum(num_tracks, num_observations)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         # (T / r)(c - r) / c / (1 - T / c) ~ F(r, c - r) is T / c ~ Beta: its upper tail loses no digits
         left = np.maximum(1.0 - statistic / clusters, 0.0)
         p = special.betainc(0.5 * (clusters - ranks), 0.5 * ranks, left)
-        gain = (z * z).sum(axis=1) - np.einsum("brr->b", spread)
-        px = sigma_px * np.sqrt(np.maximum(0.0, gain) / n)
-    out = []
-    for k, rank in enumerate(ranks.tolist()):
-        if not finite[k]:
-            out.append(untested(MisfitStatus.NOT_FINITE))
-        elif rank == 0:
-            out.append(untested(MisfitStatus.ABSORBED, 0))
-        elif clusters[k] < MIN_OBSERVATIONS_PER_RANK * rank:
-            out.append(untested(MisfitStatus.NOT_ENOUGH_EVIDENCE, rank))
-        elif math.isnan(statistic[k]):
-            out.append(untested(MisfitStatus.SINGULAR, rank))
-        elif px[k] > MAX_EFFECT_OVER_RMS * rms_px[k]:
-            out.append(untested(MisfitStatus.NOT_ESTIMABLE, rank))
-        else:
-            out.append(GroupTest(float(p[k]), float(px[k]), float(gain[k]), rank, MisfitStatus.TESTED))
-    return out
+        px = sigma_px * np.sqrt(np.maximum(0.0, gain) / num_observations)
+        refused = [
+            (~finite, MisfitStatus.NOT_FINITE),
+            (ranks == 0, MisfitStatus.ABSORBED),
+            (clusters < MIN_OBSERVATIONS_PER_RANK * ranks, MisfitStatus.NOT_ENOUGH_EVIDENCE),
+            (np.isnan(statistic), MisfitStatus.SINGULAR),
+            (px > MAX_EFFECT_OVER_RMS * rms_px, MisfitStatus.NOT_ESTIMABLE),
+        ]
+    which = np.select([holds for holds, _ in refused], np.arange(len(refused)), len(refused))
+    tested = MisfitStatus.TESTED
+    told = zip(*(each.tolist() for each in (which, p, px, gain, ranks)), strict=True)
+    return [
+        GroupTest(own_p, own_px, own_gain, r, tested)
+        if k == len(refused)
+        else untested(refused[k][1], r if k else None)
+        for k, own_p, own_px, own_gain, r in told
+    ]
 
 
 def _quadratic_forms(z: FloatArray, spread: FloatArray, kept: BoolArray) -> FloatArray:
@@ -126,7 +152,7 @@ def _quadratic_forms(z: FloatArray, spread: FloatArray, kept: BoolArray) -> Floa
     np.einsum("brr->br", scaled)[~used] = 1.0
     factor = _cholesky(scaled)
     smallest = np.where(used, np.einsum("brr->br", factor), 1.0).min(axis=1, initial=1.0)
-    sure = regular & (smallest**2 > _SINGULAR_MEAT)
+    sure = regular & (smallest**2 > SINGULAR_MEAT)
     out = np.full(len(z), math.nan)
     whitened = np.linalg.solve(factor[sure], (z / scale)[sure, :, None])[:, :, 0]
     out[sure] = (np.where(used[sure], whitened, 0.0) ** 2).sum(axis=1)

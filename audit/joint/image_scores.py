@@ -8,16 +8,19 @@ the fields' follow by a small matrix.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfm_audit.audit.cameras.projection import is_fisheye
 from sfm_audit.audit.joint.candidates import CandidateScores
 from sfm_audit.audit.joint.design import POINT
+from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE, MIN_OBSERVATIONS_PER_RANK, SINGULAR_MEAT
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.joint.system import Base, JointSystem
 from sfm_audit.audit.kernels.joint import FIELDS, SCALAR, JointSums
+from sfm_audit.audit.kernels.joint_groups import Fields, GroupLimits, GroupNumbers, group_numbers
 from sfm_audit.audit.kernels.joint_scores import Asked, IncludedArrays, JointScores, Scores, SeenArrays
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, follows_the_lens
 from sfm_audit.audit.table.words import MisfitGroup
@@ -64,23 +67,44 @@ class ScoresOfMany:
         powers : of r^2 in the radial term of the missing parameters, of each image, 0 without these
         """
         out: list[CandidateScores | None] = [None] * len(images)
-        cameras = [self._system.model.camera(int(self._system.observations.layout.camera_idx[i])) for i in images]
-        asked = [k for k, i in enumerate(images) if follows_the_lens(cameras[k].model) and self._sums.can(i)]
-        if not asked:
-            return out
-        chosen = np.array([images[k] for k in asked], dtype=np.int64)
-        power = np.array([powers[k] for k in asked], dtype=np.int64)
-        of_asked = [cameras[k] for k in asked]
-        found = self._kernel.of(asked_of(self._system, chosen, of_asked, power))
-        if found is None:
-            return out
-        for k, each in zip(asked, self._told(chosen, power, _fields_of(of_asked), found), strict=True):
+        asked = self._asked(images, powers)
+        for k, each in zip(asked.places, self._told(asked), strict=True) if asked else ():
             out[k] = each
         return out
 
-    def _told(
-        self, images: IntArray, power: IntArray, made_of: FloatArray, found: Scores
-    ) -> list[CandidateScores | None]:
+    def tested(self, images: Sequence[int], powers: Sequence[int]) -> list[GroupSumsOfImage | CandidateScores | None]:
+        """Return the same as what the tests of groups need of it, where that is certain."""
+        out: list[GroupSumsOfImage | CandidateScores | None] = [None] * len(images)
+        asked = self._asked(images, powers)
+        if asked is None:
+            return out
+        numbers = _numbers_of(asked)
+        counts = np.diff(self._system.observations.offsets)[asked.images]
+        batch = GroupSumsOfImages(asked.images, asked.sums.num_tracks, counts, numbers) if numbers else None
+        in_doubt = np.ones(len(asked.places), dtype=bool) if batch is None else ~batch.numbers.done
+        for place, k in enumerate(asked.places):
+            if batch is not None and not in_doubt[place]:
+                out[k] = GroupSumsOfImage(batch, place)
+        if in_doubt.any():
+            some = asked.only(np.flatnonzero(in_doubt))
+            for k, each in zip(some.places, self._told(some), strict=True):
+                out[k] = each
+        return out
+
+    def _asked(self, images: Sequence[int], powers: Sequence[int]) -> _Summed | None:
+        """What the kernel says of those images that it can be asked about; None where there are none."""
+        of_all = [self._system.model.camera(int(self._system.observations.layout.camera_idx[i])) for i in images]
+        asked = [k for k, i in enumerate(images) if follows_the_lens(of_all[k].model) and self._sums.can(i)]
+        if not asked:
+            return None
+        chosen = np.array([images[k] for k in asked], dtype=np.int64)
+        power = np.array([powers[k] for k in asked], dtype=np.int64)
+        cameras = [of_all[k] for k in asked]
+        found = self._kernel.of(asked_of(self._system, chosen, cameras, power))
+        return None if found is None else _Summed(asked, chosen, power, _factors_of(cameras), found)
+
+    def _told(self, asked: _Summed) -> list[CandidateScores | None]:
+        images, power, found, made_of = asked.images, asked.power, asked.sums, _fields_of(asked.factor)
         turned = made_of.transpose(0, 2, 1)
         with np.errstate(over="ignore", invalid="ignore"):
             done = found.done & np.isfinite(found.gram).all(axis=(1, 2)) & np.isfinite(found.meat).all(axis=(1, 2))
@@ -107,6 +131,54 @@ class ScoresOfMany:
         return out
 
 
+class _Summed(NamedTuple):
+    """What the kernel says of some images.
+
+    places: where among those that were asked for.    factor: see `_factors_of`.
+    """
+
+    places: list[int]
+    images: IntArray
+    power: IntArray
+    factor: FloatArray
+    sums: Scores
+
+    def only(self, chosen: IntArray) -> _Summed:
+        """Those of some of the images."""
+        places = [self.places[k] for k in chosen.tolist()]
+        return _Summed(places, self.images[chosen], self.power[chosen], self.factor[chosen], self.sums.only(chosen))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupSumsOfImages:
+    """What the tests of all groups of some images (k,) need.    num_tracks, num_observations: (k,)."""
+
+    images: IntArray
+    num_tracks: IntArray
+    num_observations: IntArray
+    numbers: GroupNumbers
+
+
+class GroupSumsOfImage(NamedTuple):
+    """One of these images, by its place among them."""
+
+    batch: GroupSumsOfImages
+    place: int
+
+    def missing(self) -> CandidateScores:
+        """Return the scores of the missing parameters, without what they do to the base."""
+        k, numbers, nowhere = self.place, self.batch.numbers, np.zeros((0, _MISSING))
+        of_fields = numbers.rest_square[k], numbers.rest_gram[k], numbers.rest_score[k], numbers.rest_meat[k]
+        counts = int(self.batch.num_tracks[k]), int(self.batch.num_observations[k])
+        return CandidateScores(*of_fields, counts[0], nowhere, np.zeros(0, dtype=np.int64), nowhere, counts[1])
+
+
+def _numbers_of(asked: _Summed) -> GroupNumbers | None:
+    """All groups of some images by the kernel; None where there is none."""
+    limits = GroupLimits(_LEFT_OF_TERMS, KEPT_EIGENVALUE, SINGULAR_MEAT, MIN_OBSERVATIONS_PER_RANK)
+    return group_numbers(asked.sums, Fields(_TERMS, asked.factor, _ENDS, asked.power > 0), limits)
+
+
 def scores_of_many(system: JointSystem, base: Base) -> ScoresOfMany | None:
     """Return who asks about many images at once; None where each has to be asked by numpy."""
     sums = sums_of_base(base)
@@ -130,18 +202,14 @@ def asked_of(system: JointSystem, images: IntArray, cameras: Sequence[CameraReco
 
 def missing_of(camera: CameraRecord) -> FloatArray:
     """(44, 6) of which functions the columns of the missing parameters are made (`implied`)."""
-    return np.asarray(_fields_of([camera])[0, :, NUM_FIELDS:])
+    return np.asarray(_fields_of(_factors_of([camera]))[0, :, NUM_FIELDS:])
 
 
 def _facts(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord]) -> FloatArray:
     """(k, 27) facts of `JointSums.fields`."""
     table = system.model.images
     rotation = rotation_from_quat(table.quat_cam_from_world_wxyz[images])
-    size = [
-        (*camera.params[list(camera.model.focal_idxs)][[0, -1]].tolist(), camera.width, camera.height)
-        for camera in cameras
-    ]
-    fx, fy, width, height = np.array(size, dtype=np.float64).reshape(-1, 4).T
+    fx, fy, _, _, width, height = _lenses(cameras).T
     if system.observations.layout.has_rigs:
         inverse = np.linalg.pinv(rotation)
     else:
@@ -151,43 +219,60 @@ def _facts(system: JointSystem, images: IntArray, cameras: Sequence[CameraRecord
     return np.concatenate([*pose, lens, inverse.reshape(-1, 9)], axis=1)
 
 
-def _fields_of(cameras: Sequence[CameraRecord]) -> FloatArray:
-    """(B, 44, 48) the same of some cameras, the missing parameters included."""
-    out = np.zeros((len(cameras), FIELDS, NUM_FIELDS + _MISSING))
-    numbers = [
-        (*(camera.params[list(idxs)][[0, -1]] for idxs in _of_camera(camera)), camera.width, camera.height)
-        for camera in cameras
-    ]
-    (fx, fy), (cx, cy) = (np.array([each[k] for each in numbers]).reshape(-1, 2).T for k in range(2))
-    width, height = np.array([each[2:] for each in numbers], dtype=np.float64).reshape(-1, 2).T
-    half = 0.5 * np.maximum(width, height)
-    radial, tangential, affine, shift, rolling, smooth = (
-        GROUP_COLUMNS[group].start
-        for group in (
-            *(MisfitGroup.RADIAL, MisfitGroup.TANGENTIAL, MisfitGroup.AFFINE, MisfitGroup.PRINCIPAL_POINT),
-            *(MisfitGroup.ROLLING_SHUTTER, MisfitGroup.SMOOTH),
+def _terms() -> IntArray:
+    """(48, 2) functions of each field, the missing parameters' included; -1 where it has one only."""
+    out = np.full((NUM_FIELDS + _MISSING, 2), -1)
+    first = {group: own.start for group, own in GROUP_COLUMNS.items()}
+    affine, tangential, smooth = first[MisfitGroup.AFFINE], first[MisfitGroup.TANGENTIAL], first[MisfitGroup.SMOOTH]
+    for axis in range(2):
+        out[first[MisfitGroup.RADIAL] + axis, 0] = _BOTH + axis
+        out[tangential + axis, 0] = _BOTH + 2 + axis
+        out[affine + axis] = _X, _X + 1 + axis  # fx v_x = x - cx
+        out[first[MisfitGroup.PRINCIPAL_POINT] + axis, 0] = (_X, _Y)[axis]
+        out[smooth + axis * _MONOMIALS : smooth + (axis + 1) * _MONOMIALS, 0] = (
+            (_X, _Y)[axis] + 1 + np.arange(_MONOMIALS)
         )
-    )
-    for k in range(2):
-        out[:, _BOTH + k, radial + k] = 1.0
-        out[:, _BOTH + 2 + k, tangential + k] = 1.0
-    out[:, _X, affine], out[:, _X + 1, affine] = 0.5 * width - cx, half  # fx v_x = x - cx
-    out[:, _X, affine + 1], out[:, _X + 2, affine + 1] = fx / fy * (0.5 * height - cy), fx / fy * half
-    out[:, _X, shift], out[:, _Y, shift + 1] = fx, fy
-    out[:, _ROLLING : _ROLLING + 6, rolling : rolling + 6] = np.eye(6)
-    for k in range(SCALAR - 2):
-        out[:, _X + 1 + k, smooth + k] = 1.0
-        out[:, _Y + 1 + k, smooth + SCALAR - 2 + k] = 1.0
-    last = NUM_FIELDS
-    out[:, _X, last], out[:, _Y, last + 1], out[:, _NEXT, last + 2] = 1.0, 1.0, 1.0
-    out[:, :, last + 3] = out[:, :, affine]
-    out[:, :, last + 4 : last + 6] = out[:, :, tangential : tangential + 2]
+    rolling = first[MisfitGroup.ROLLING_SHUTTER]
+    out[rolling : rolling + 6, 0] = _ROLLING + np.arange(6)
+    out[NUM_FIELDS:] = [(_X, -1), (_Y, -1), (_NEXT, -1), out[affine], *out[tangential : tangential + 2]]
     return out
 
 
-def _of_camera(camera: CameraRecord) -> tuple[Sequence[int], Sequence[int]]:
-    """Which of its parameters are focal lengths and the principal point."""
-    return camera.model.focal_idxs, camera.model.principal_point_idxs
+_MONOMIALS: Final = SCALAR - 2
+_TERMS: Final = _terms()
+_ENDS: Final = np.array([0, *(own.stop for own in GROUP_COLUMNS.values())])
+
+
+def _factors_of(cameras: Sequence[CameraRecord]) -> FloatArray:
+    """(B, 48, 2) how much of each of these functions is in a field, of each camera."""
+    fx, fy, cx, cy, width, height = _lenses(cameras).T
+    half = 0.5 * np.maximum(width, height)
+    out = np.ones((len(cameras), *_TERMS.shape))
+    affine, shift = GROUP_COLUMNS[MisfitGroup.AFFINE].start, GROUP_COLUMNS[MisfitGroup.PRINCIPAL_POINT].start
+    out[:, affine, 0], out[:, affine, 1] = 0.5 * width - cx, half
+    out[:, affine + 1, 0], out[:, affine + 1, 1] = fx / fy * (0.5 * height - cy), fx / fy * half
+    out[:, shift, 0], out[:, shift + 1, 0] = fx, fy
+    out[:, NUM_FIELDS + 3] = out[:, affine]
+    return out
+
+
+def _fields_of(factor: FloatArray) -> FloatArray:
+    """(B, 44, 48) the same as a matrix, fields as its columns."""
+    out = np.zeros((len(factor), FIELDS, len(_TERMS)))
+    for term in range(_TERMS.shape[1]):
+        has = np.flatnonzero(_TERMS[:, term] >= 0)
+        out[:, _TERMS[has, term], has] = factor[:, has, term]
+    return out
+
+
+def _lenses(cameras: Sequence[CameraRecord]) -> FloatArray:
+    """(B, 6) fx, fy, cx, cy, width, height."""
+    out = []
+    for camera in cameras:
+        params, focals, centre = camera.params.tolist(), camera.model.focal_idxs, camera.model.principal_point_idxs
+        lens = params[focals[0]], params[focals[-1]], params[centre[0]], params[centre[-1]]
+        out.append((*lens, camera.width, camera.height))
+    return np.array(out, dtype=np.float64).reshape(-1, 6)
 
 
 def _squares(plain: FloatArray, dense_plain: FloatArray) -> FloatArray:

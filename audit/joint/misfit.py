@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple, Protocol
@@ -13,11 +13,12 @@ import numpy as np
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
-from sfm_audit.audit.joint.group_test import GroupTest, group_root, test_groups, untested
-from sfm_audit.audit.joint.image_scores import scores_of_many
+from sfm_audit.audit.joint.group_test import GroupTest, group_root, untested
+from sfm_audit.audit.joint.image_scores import GroupSumsOfImage, scores_of_many
+from sfm_audit.audit.joint.image_tests import ImageTests, tests_of_scores, tests_of_sums
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.system import JointSystem
-from sfm_audit.audit.joint.worth import NO_WORTH, Worth, worth_of
+from sfm_audit.audit.joint.worth import NO_WORTH, Worth
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.audit.misfit.fields import GROUP_COLUMNS, NUM_FIELDS, candidate_fields
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg, holm
@@ -28,6 +29,10 @@ from sfm_audit.loaders.model import CameraRecord
 MAX_ROUNDS: Final = 8
 _INCLUDE_FROM_PX: Final = 0.1
 _SHARE_OF_LARGEST: Final = 0.5
+
+
+OfImage = GroupSumsOfImage | CandidateScores | None
+"""What the tests of an image ask for; None where it has no candidate fields."""
 
 
 class JointTest(NamedTuple):
@@ -203,16 +208,25 @@ class _Rounds:
         self._q[waiting] = benjamini_hochberg(holm(p).T).T
         self._least_p[waiting] = np.fmin.reduce(p, axis=1)
 
-    def _scores_of(self, images: Sequence[int]) -> list[CandidateScores | None]:
-        """Of each image, all that its tests ask for."""
+    def _scores_of(self, images: Sequence[int]) -> list[OfImage]:
+        """Of each image, what its tests ask for."""
         powers = [0 if self._beside is None else self._beside.power(image) for image in images]
-        compiled = [None] * len(images) if self._many is None else self._many.scores(images, powers)
-        out: list[CandidateScores | None] = []
+        compiled = [None] * len(images) if self._many is None else self._many.tested(images, powers)
+        out: list[OfImage] = []
         for image, power, found in zip(images, powers, compiled, strict=True):
-            if found is not None and power and self._beside is not None:
-                self._beside.take(image, found.only(slice(NUM_FIELDS, None)))
-            out.append(self._by_numpy(image) if found is None else found.only(slice(0, NUM_FIELDS)))
+            if found is None:
+                out.append(self._by_numpy(image))
+                continue
+            own, missing = (found, found.missing) if isinstance(found, GroupSumsOfImage) else _divided(found)
+            if power and self._beside is not None:
+                self._beside.take(image, missing())
+            out.append(own)
         return out
+
+    def _scores(self, image: int) -> CandidateScores | None:
+        """The scores of all candidate fields of an image."""
+        [compiled] = [None] if self._many is None else self._many.scores([image], [0])
+        return self._by_numpy(image) if compiled is None else compiled
 
     def _by_numpy(self, image: int) -> CandidateScores | None:
         fields: ImageFields | FieldsInParts
@@ -227,8 +241,9 @@ class _Rounds:
         scores = candidate_scores(self._base, [image], lambda _: fields)
         if self._beside is None:
             return scores
-        self._beside.take(image, scores.only(slice(NUM_FIELDS, None)))
-        return scores.only(slice(0, NUM_FIELDS))
+        own, missing = _divided(scores)
+        self._beside.take(image, missing())
+        return own
 
     def _significant(self, image: int) -> list[MisfitGroup]:
         return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
@@ -236,7 +251,7 @@ class _Rounds:
     def _effects(self) -> FloatArray:
         """(I,) largest effect among significant groups."""
         out = np.zeros(len(self.tests))  # nothing is significant where nothing was tested
-        for i in np.flatnonzero(self._tested).tolist():
+        for i in np.flatnonzero((self._q < self._alpha).any(axis=1)).tolist():
             out[i] = max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
         return out
 
@@ -244,7 +259,7 @@ class _Rounds:
         candidates = []
         for image in np.flatnonzero(new).tolist():
             group = max(self._significant(image), key=lambda g: self.tests[image][g].px)
-            [scores] = self._scores_of([image])
+            scores = self._scores(image)
             if scores is not None:
                 own = GROUP_COLUMNS[group]
                 root = group_root(scores, own)
@@ -273,6 +288,7 @@ class _Rounds:
         causes: list[MisfitGroup | None] = [None] * len(tests)
         for image in np.flatnonzero(self._tested).tolist():
             tests[image] = self._joint_tests(image)
+        for image in np.flatnonzero((self._q < self._alpha).any(axis=1)).tolist():
             causes[image] = self._cause(image, tests[image])
         effect = np.where(self._tested, self._effects(), np.nan)
         return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
@@ -304,24 +320,17 @@ def _fields_of(
     return ImageFields(fields, system.observations.nuisance(image, chosen))
 
 
+def _divided(scores: CandidateScores) -> tuple[CandidateScores, Callable[[], CandidateScores]]:
+    """Those of the candidate fields, and those of the parameters that the camera may lack."""
+    return scores.only(slice(0, NUM_FIELDS)), partial(scores.only, slice(NUM_FIELDS, None))
+
+
 def _image_tests(
-    system: JointSystem, images: Sequence[int], scores: Sequence[CandidateScores | None], alpha: float
-) -> list[tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]]:
+    system: JointSystem, images: Sequence[int], scores: Sequence[OfImage], alpha: float
+) -> list[ImageTests]:
     """Of each image the tests of all groups, and the worth of those that may be significant."""
-    observations = system.observations
-    known = [each for each in scores if each is not None]
-    asked = [image for image, each in zip(images, scores, strict=True) if each is not None]
-    sigma_px, rms_px = observations.sigma_px[asked], observations.rms_px[asked]
-    by_group = {group: test_groups(known, own, sigma_px, rms_px) for group, own in GROUP_COLUMNS.items()}
-    found: dict[int, tuple[dict[MisfitGroup, GroupTest], dict[MisfitGroup, Worth]]] = {}
-    for k, image in enumerate(asked):
-        tests = {group: answers[k] for group, answers in by_group.items()}
-        told = {group: own for group, own in GROUP_COLUMNS.items() if tests[group].p < alpha}
-        depth = system.median_depth(image) if told else math.nan
-        worth = {
-            group: worth_of(system, image, known[k], own, group_root(known[k], own), depth=depth)
-            for group, own in told.items()
-        }
-        found[image] = tests, worth
+    summed = [each for each in scores if isinstance(each, GroupSumsOfImage)]
+    known = {i: each for i, each in zip(images, scores, strict=True) if isinstance(each, CandidateScores)}
+    found = {**tests_of_sums(system, summed, alpha), **tests_of_scores(system, known, alpha)}
     nothing = dict.fromkeys(GROUPS, untested(MisfitStatus.NO_FIELDS))
     return [found.get(image, (nothing, {})) for image in images]

@@ -21,7 +21,7 @@ from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps,
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
 from sfm_audit.audit.joint.sums import joint_sums, moved_by
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel
+from sfm_audit.loaders.model import SparseModel, rotation_from_quat
 
 _DIRECT: Final = 1500  # columns up to which the plain step gets a factor of its own
 _COLUMNS_AT_ONCE: Final = 400
@@ -76,9 +76,13 @@ class JointSystem:
 
     def median_depth(self, image_idx: int) -> float:
         """Median depth of the points that an image sees in the system, model units."""
-        points = self.residuals.point_idx[self.observations.source[self.observations.rows(image_idx)]]
-        xyz_cam = self.model.image(image_idx).cam_from_world(self.model.points.xyz_world.take(points, axis=0))
-        return float(np.median(xyz_cam[:, 2])) if len(xyz_cam) else math.nan
+        observations, images = self.observations, self.model.images
+        points = observations.points.take(observations.point_idx[observations.rows(image_idx)])
+        if not points.size:
+            return math.nan
+        axis = rotation_from_quat(images.quat_cam_from_world_wxyz[image_idx])[2]
+        depth = self.model.points.xyz_world.take(points, axis=0) @ axis
+        return float(np.median(depth) + images.translation_cam_from_world[image_idx, 2])
 
     def relief_change(self, image_idx: int) -> float:
         """By how much the step changes an image's depth relative to the relief of its points (relative change)."""

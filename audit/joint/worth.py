@@ -10,7 +10,7 @@ import numpy as np
 from sfm_audit.audit.joint.candidates import CandidateScores
 from sfm_audit.audit.joint.layout import NUM_POSE
 from sfm_audit.audit.joint.system import JointSystem
-from sfm_audit.loaders.arrays import FloatArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
 class Worth(NamedTuple):
@@ -48,18 +48,28 @@ def worth_of(
     layout = system.observations.layout
     theta = root.T @ (root @ scores.score[own])
     columns = layout.columns[image_idx]
-    columns = columns[columns < layout.num_columns]
+    has_column = columns < layout.num_columns
+    columns = columns[has_column]
     at = np.searchsorted(scores.support, columns)
     present = (at < scores.support.size) & (scores.support[np.minimum(at, scores.support.size - 1)] == columns)
     if not present.all():
         return NO_WORTH
-    change = -scores.solution[at, own] @ theta
-    pose = layout.image_from_frame[image_idx] @ change[:NUM_POSE]
-    return Worth(
-        math.degrees(float(np.sqrt(pose[:3] @ pose[:3]))),
-        float(np.sqrt(pose[3:] @ pose[3:])) / depth,
-        _focal_change(system, image_idx, change[NUM_POSE:]),
-    )
+    change = np.zeros((1, layout.width))
+    change[0, has_column] = -scores.solution[at, own] @ theta
+    return worths_of(system, np.array([image_idx]), change, np.array([depth]))[0]
+
+
+def worths_of(system: JointSystem, image_idxs: IntArray, change: FloatArray, depth: FloatArray) -> list[Worth]:
+    """Return the same of m images whose columns the base moves.
+
+    Parameters
+    ----------
+    change : (m, C) of each image's columns        depth : (m,)
+    """
+    pose = (system.observations.layout.image_from_frame[image_idxs] * change[:, None, :NUM_POSE]).sum(axis=2)
+    angle, shift = (np.sqrt((pose[:, part] ** 2).sum(axis=1)) for part in (slice(3), slice(3, None)))
+    focal = [_focal_change(system, i, own) for i, own in zip(image_idxs.tolist(), change[:, NUM_POSE:], strict=True)]
+    return [Worth(*each) for each in zip(np.degrees(angle).tolist(), (shift / depth).tolist(), focal, strict=True)]
 
 
 def _focal_change(system: JointSystem, image_idx: int, change: FloatArray) -> float:

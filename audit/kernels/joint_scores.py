@@ -92,6 +92,10 @@ class Scores(NamedTuple):
     right: FloatArray
     solution: FloatArray
 
+    def only(self, chosen: IntArray) -> Scores:
+        """Those of some of the images."""
+        return Scores(*(each[chosen] for each in self))  # type: ignore[arg-type]
+
 
 class _Inverse(ctypes.Structure):
     """`base_inverse` of joint_scores.c."""

@@ -136,7 +136,7 @@ TARGETS: Final = (
         "audit/joint/group_test.py",
         ROUNDS,
         (
-            *("test_group", "group_root", "_roots", "_judged", "_quadratic_forms", "_cholesky"),
+            *("test_group", "group_root", "_roots", "_judged", "answers", "_quadratic_forms", "_cholesky"),
             *("KEPT_EIGENVALUE", "MIN_OBSERVATIONS_PER_RANK"),
             "MAX_EFFECT_OVER_RMS",
         ),
