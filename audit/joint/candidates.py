@@ -98,33 +98,66 @@ def candidate_scores(
     Where an image has more than 32,768 observations everything is gone through in parts, and what the tracks add up to
     comes in a second round. Sums are in the order of points, whatever the machine.
     """
-    observations = base.observations
-    points = _points_of(base, images)
-    in_parts = any(observations.num_of(image) > AT_ONCE for image in images)
-    parts = _parts(points.size) if in_parts else [slice(0, points.size)]
-    around = _Surroundings(base, points, parts)
-    coupling = _Coupling(base, around.images())
-    sums = _OwnSums(base, points, coupling, images, fields_of)
-    kept_scores: FloatArray | None = None
-    for part in parts:
-        absorbed = sums.add(part, in_parts=in_parts)
-        for own, near in around.of(part) if not observations.points_independent else ():
-            kept_scores = coupling.subtract_tracks(sums.right, near, absorbed[own], keep=around.is_one)
-    right, gram, sq_length = sums.right, sums.gram, sums.gram.diagonal().copy()
-    for gone in sums.eliminated:
-        gram -= gone
+    met = _Met(base, images, fields_of, keep_scores=True)
+    right, coupling, gram = met.right, met.coupling, met.gram
     solution = base.inverse.within(coupling.support, right[:-1])
     gram -= right[:-1].T @ solution
     padded = np.vstack([solution, np.zeros((1, len(gram)))])
     meat = np.zeros_like(gram)
-    for part in parts:
-        own_score = sums.track_scores(part) if in_parts else sums.track_score
-        coupling.subtract_scores(own_score, around.of(part), padded, kept_scores)
+    for part in met.parts:
+        own_score = met.sums.track_scores(part) if met.in_parts else met.sums.track_score
+        coupling.subtract_scores(own_score, met.around.of(part), padded, met.kept_scores)
         with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
             meat += own_score.T @ own_score
-    num_observations = sum(observations.num_of(image) for image in images)
-    of_fields = sq_length, 0.5 * (gram + gram.T), sums.score, meat, points.size
+    num_observations = sum(base.observations.num_of(image) for image in images)
+    of_fields = met.sq_length, 0.5 * (gram + gram.T), met.sums.score, meat, met.num_points
     return CandidateScores(*of_fields, right[:-1], coupling.support, solution, num_observations)
+
+
+def scores_everywhere(base: Base, image: int, fields: FieldsInParts) -> tuple[CandidateScores, FloatArray]:
+    """Return the scores of fields of one image, without their meat, and (D + m, c) S^+ R at all columns of the base."""
+    met = _Met(base, [image], lambda _: fields, keep_scores=False)
+    right, support = met.right[:-1], met.coupling.support
+    solution = base.inverse.times(support, right)
+    own = solution[support]
+    gram = met.gram - right.T @ own
+    of_fields = met.sq_length, 0.5 * (gram + gram.T), met.sums.score, np.full(gram.shape, np.nan), met.num_points
+    num_observations = base.observations.num_of(image)
+    return CandidateScores(*of_fields, right, support, own, num_observations), solution
+
+
+class _Met:
+    """What candidate fields meet: N^T E off the points, and their products among each other.
+
+    right: (s + 1, c) R and a row of padding.    gram: (c, c) E^T E - (J^T E)^T V^-1 (J^T E).    sq_length: (c,).
+    kept_scores: of the views, where they are asked for and at hand.
+    """
+
+    def __init__(
+        self,
+        base: Base,
+        images: Sequence[int],
+        fields_of: Callable[[int], ImageFields | FieldsInParts],
+        *,
+        keep_scores: bool,
+    ) -> None:
+        observations = base.observations
+        points = _points_of(base, images)
+        self.num_points = points.size
+        self.in_parts = any(observations.num_of(image) > AT_ONCE for image in images)
+        self.parts = _parts(points.size) if self.in_parts else [slice(0, points.size)]
+        self.around = _Surroundings(base, points, self.parts)
+        self.coupling = _Coupling(base, self.around.images())
+        self.sums = _OwnSums(base, points, self.coupling, images, fields_of)
+        self.kept_scores: FloatArray | None = None
+        keep = keep_scores and self.around.is_one
+        for part in self.parts:
+            absorbed = self.sums.add(part, in_parts=self.in_parts)
+            for own, near in self.around.of(part) if not observations.points_independent else ():
+                self.kept_scores = self.coupling.subtract_tracks(self.sums.right, near, absorbed[own], keep=keep)
+        self.right, self.gram, self.sq_length = self.sums.right, self.sums.gram, self.sums.gram.diagonal().copy()
+        for gone in self.sums.eliminated:
+            self.gram -= gone
 
 
 def _points_of(base: Base, images: Sequence[int]) -> IntArray:

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
-from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
-from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE
+from sfm_audit.audit.joint.candidates import FieldsInParts, ImageFields, scores_everywhere
+from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE, group_root
+from sfm_audit.audit.joint.neighbourhood import sum_by_track
 from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
-from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """Fields of one image that are to be free.
 
-    fields: (n_i, 2, r) px per unit.    nuisance: gives (n, 2, C) px per unit, nuisance columns of chosen observations.
+    fields: (n_i, 2, c) px per unit.    nuisance: gives (n, 2, C) px per unit, nuisance columns of chosen observations.
     """
 
     image_idx: int
@@ -30,6 +32,21 @@ class Candidate:
         return ImageFields(self.fields[chosen], self.nuisance(chosen))
 
 
+class _New(NamedTuple):
+    """Fields (n_i, 2, r) of one image with K = 1, what they meet, and (D + m, r) B = S^+ R.    gram: (r, r) K.
+
+    right: (s, r) R at ``support``.
+    """
+
+    image_idx: int
+    fields: FloatArray
+    gram: FloatArray
+    score: FloatArray
+    support: IntArray
+    right: FloatArray
+    solution: FloatArray
+
+
 def include(base: Base, candidates: list[Candidate]) -> Base:
     """Return the base with the candidates' fields free, all at once.
 
@@ -38,61 +55,70 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = K^+ u with K of all new fields together (those of two images meet in shared points), step -> step - B
     theta, and the inverse gets a border. Directions of K with unit columns below 1e-4 stay out, as in the test.
     """
-    by_image = {c.image_idx: FieldsInParts(c.part) for c in candidates}
-    scores = [candidate_scores(base, [c.image_idx], by_image.__getitem__) for c in candidates]
-    starts = np.cumsum([0, *(c.fields.shape[2] for c in candidates)])
+    new = [_independent(base, each) for each in candidates]
+    starts = np.cumsum([0, *(own.gram.shape[0] for own in new)])
     size = base.inverse.size
-    solution = np.empty((size, int(starts[-1])))
-    for k, own in enumerate(scores):
-        solution[:, starts[k] : starts[k + 1]] = base.inverse.times(own.support, own.coupling)
-    schur = _joint_gram(base, candidates, scores, starts, solution)
-    root = _inverse_root(schur)
-    theta = root @ (root.T @ np.concatenate([own.score for own in scores]))
+    solution = np.concatenate([own.solution for own in new], axis=1)
+    root = _inverse_root(_joint_gram(base, new, starts, solution))
+    theta = root @ (root.T @ np.concatenate([own.score for own in new]))
     step = np.concatenate([base.step - solution @ theta, theta])
     included = dict(base.included)
-    for k, candidate in enumerate(candidates):
+    for k, own in enumerate(new):
         columns = size + np.arange(starts[k], starts[k + 1])
-        included[candidate.image_idx] = IncludedFields(candidate.image_idx, candidate.fields, columns)
+        included[own.image_idx] = IncludedFields(own.image_idx, own.fields, columns)
     grown = replace(base, inverse=base.inverse.bordered(solution, root), included=included)
     return with_step(grown, step)
 
 
-def _joint_gram(
-    base: Base,
-    candidates: list[Candidate],
-    scores: list[CandidateScores],
-    starts: FloatArray,
-    solution: FloatArray,
-) -> FloatArray:
+def _independent(base: Base, candidate: Candidate) -> _New:
+    """The directions of a candidate's fields that the base leaves, in units in which K = 1."""
+    scores, solution = scores_everywhere(base, candidate.image_idx, FieldsInParts(candidate.part))
+    root = group_root(scores, slice(0, candidate.fields.shape[2]))
+    gram = root @ scores.gram @ root.T
+    turned = (each @ root.T for each in (scores.coupling, solution))
+    return _New(candidate.image_idx, candidate.fields @ root.T, gram, root @ scores.score, scores.support, *turned)
+
+
+def _joint_gram(base: Base, new: list[_New], starts: IntArray, solution: FloatArray) -> FloatArray:
     """K (k, k) of all new fields: - (J^T E)^T V^-1 (J^T E) - R^T B between images, the tests' own K within."""
-    if len(candidates) == 1:
-        return 0.5 * (scores[0].gram + scores[0].gram.T)
-    observations = base.observations
-    total = int(starts[-1])
-    coupled = np.zeros((base.inverse.size, total))
-    parts = []
-    for k, (candidate, own) in enumerate(zip(candidates, scores, strict=True)):
-        columns = slice(int(starts[k]), int(starts[k + 1]))
-        coupled[own.support, columns] = own.coupling
-        rows = observations.rows(candidate.image_idx)
-        weighted = candidate.fields * observations.weight[rows, None, None]
-        crossed = observations.jacobian(candidate.image_idx).transpose(0, 2, 1) @ weighted
-        shape = (3 * observations.num_points, columns.stop - columns.start)
-        row = 3 * observations.point_idx[rows][:, None, None] + np.arange(3)[:, None] + np.zeros(shape[1], dtype=int)
-        column = np.broadcast_to(np.arange(shape[1]), crossed.shape)
-        parts.append(sparse.coo_array((crossed.ravel(), (row.ravel(), column.ravel())), shape=shape).tocsc())
-    out = -coupled.T @ solution
-    crossed_all = sparse.hstack(parts).tocsr()
-    seen = distinct(crossed_all.nonzero()[0] // 3)
-    inverse = sparse.bsr_array(
-        (base.point_inverse[seen], seen, np.searchsorted(seen, np.arange(observations.num_points + 1))),
-        shape=(3 * observations.num_points,) * 2,
-    )
-    out -= (crossed_all.T @ (inverse.tocsr() @ crossed_all)).toarray()
-    for k, own in enumerate(scores):
-        columns = slice(int(starts[k]), int(starts[k + 1]))
-        out[columns, columns] = own.gram
+    out = np.zeros((int(starts[-1]),) * 2)
+    places = [slice(int(first), int(last)) for first, last in pairwise(starts)]
+    for place, own in zip(places, new, strict=True):
+        out[place] = -own.right.T @ solution[own.support]
+    at_shared = [_at_shared_points(base, own, shared) for shared in [_shared_points(base, new)] for own in new]
+    for i, (points, crossed) in enumerate(at_shared):
+        for k in range(i + 1, len(new)):
+            others, other = at_shared[k]
+            if not (points.size and others.size and points[0] <= others[-1] and others[0] <= points[-1]):
+                continue
+            _, mine, theirs = np.intersect1d(points, others, assume_unique=True, return_indices=True)
+            absorbed = base.point_inverse[points[mine]] @ crossed[mine]
+            met = absorbed.reshape(-1, absorbed.shape[2]).T @ other[theirs].reshape(-1, other.shape[2])
+            out[places[i], places[k]] -= met
+            out[places[k], places[i]] -= met.T
+    for place, own in zip(places, new, strict=True):
+        out[place, place] = own.gram
     return 0.5 * (out + out.T)
+
+
+def _shared_points(base: Base, new: list[_New]) -> BoolArray:
+    """(P,) points that several of the images show."""
+    observations = base.observations
+    count = np.zeros(observations.num_points, dtype=np.int64)
+    for own in new:
+        count[distinct(observations.point_idx[observations.rows(own.image_idx)])] += 1
+    return count > 1
+
+
+def _at_shared_points(base: Base, own: _New, shared: BoolArray) -> tuple[IntArray, FloatArray]:
+    """Those points that an image shows (t,), and (t, 3, r) J^T w E of each."""
+    observations = base.observations
+    rows = observations.rows(own.image_idx)
+    chosen = np.flatnonzero(shared[observations.point_idx[rows]])
+    points, place = np.unique(observations.point_idx[rows][chosen].astype(np.int64), return_inverse=True)
+    weighted = own.fields[chosen] * observations.weight[rows][chosen, None, None]
+    crossed = observations.jacobian(own.image_idx, chosen).transpose(0, 2, 1) @ weighted
+    return points, sum_by_track(crossed, place, points.size)
 
 
 def _inverse_root(schur: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from sfm_audit.audit.inliers.projected import ProjectedImage
 from sfm_audit.audit.joint.candidates import CandidateScores, FieldsInParts, ImageFields, candidate_scores
 from sfm_audit.audit.joint.design import AT_ONCE, EVERY
-from sfm_audit.audit.joint.group_test import GroupTest, group_root, untested
+from sfm_audit.audit.joint.group_test import GroupTest, untested
 from sfm_audit.audit.joint.image_scores import GroupSumsOfImage, scores_of_many
 from sfm_audit.audit.joint.image_tests import ImageTests, tests_of_scores, tests_of_sums
 from sfm_audit.audit.joint.inclusion import Candidate, include
@@ -223,11 +223,6 @@ class _Rounds:
             out.append(own)
         return out
 
-    def _scores(self, image: int) -> CandidateScores | None:
-        """The scores of all candidate fields of an image."""
-        [compiled] = [None] if self._many is None else self._many.scores([image], [0])
-        return self._by_numpy(image) if compiled is None else compiled
-
     def _by_numpy(self, image: int) -> CandidateScores | None:
         fields: ImageFields | FieldsInParts
         if self._system.observations.num_of(image) <= AT_ONCE:
@@ -256,17 +251,11 @@ class _Rounds:
         return out
 
     def _include(self, new: BoolArray) -> None:
-        candidates = []
+        candidates, observations = [], self._system.observations
         for image in np.flatnonzero(new).tolist():
-            group = max(self._significant(image), key=lambda g: self.tests[image][g].px)
-            scores = self._scores(image)
-            if scores is not None:
-                own = GROUP_COLUMNS[group]
-                root = group_root(scores, own)
-                observations = self._system.observations
-                parts = (_fields_of(self._system, image, chosen=part).fields for part in observations.parts(image))
-                fields = np.concatenate([part[:, :, own] @ root.T for part in parts])
-                candidates.append(Candidate(image, fields, partial(observations.nuisance, image)))
+            own = GROUP_COLUMNS[max(self._significant(image), key=lambda g: self.tests[image][g].px)]
+            parts = (_columns_of(self._system, image, chosen=part)[:, :, own] for part in observations.parts(image))
+            candidates.append(Candidate(image, np.concatenate(list(parts)), partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
         self._many = scores_of_many(self._system, self._base)
 
@@ -311,13 +300,19 @@ def _fields_of(
     system: JointSystem, image: int, beside: Beside | None = None, chosen: slice | IntArray = EVERY
 ) -> ImageFields:
     """42 candidate fields of an image, px per unit, and those of ``beside``; none of panoramas."""
+    return ImageFields(_columns_of(system, image, beside, chosen), system.observations.nuisance(image, chosen))
+
+
+def _columns_of(
+    system: JointSystem, image: int, beside: Beside | None = None, chosen: slice | IntArray = EVERY
+) -> FloatArray:
+    """(n, 2, c) the same without nuisance columns."""
     inliers = system.observations.inliers(image, chosen)
     camera, projected = inliers.camera, inliers.projected
     candidates = candidate_fields(camera, projected)
     if beside is not None and len(candidates):
         candidates = np.concatenate([candidates, beside.fields(image, camera, projected, candidates)])
-    fields = np.ascontiguousarray(candidates.transpose(2, 1, 0))
-    return ImageFields(fields, system.observations.nuisance(image, chosen))
+    return np.ascontiguousarray(candidates.transpose(2, 1, 0))
 
 
 def _divided(scores: CandidateScores) -> tuple[CandidateScores, Callable[[], CandidateScores]]:

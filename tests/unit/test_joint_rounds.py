@@ -53,7 +53,7 @@ class Rounds:
         monkeypatch.setattr(joint_room, "scores_of_many", lambda *_: None)
         monkeypatch.setattr(joint_room, "_fields_of", lambda *_, **__: fields)
         monkeypatch.setattr(joint_room, "candidate_scores", lambda *_: "scores")
-        monkeypatch.setattr(joint_room, "group_root", lambda _, own: np.eye(own.stop - own.start) * own.start)
+        monkeypatch.setattr(joint_room, "_columns_of", lambda *_, **__: fields.fields)
         monkeypatch.setattr(joint_room, "_image_tests", self._tests)
         monkeypatch.setattr(joint_room, "include", self._include)
 
