@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from sfm_audit.audit.kernels.joint_matrix import Blocks, checked_blocks, times_blocks
-from sfm_audit.loaders.arrays import FloatArray, IntArray, distinct
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 
 class PairMatrix:
@@ -36,6 +36,9 @@ class PairMatrix:
     def diagonal(self) -> FloatArray:
         """(D,)."""
         size, rows, columns, blocks = self.blocks
+        first, second = rows[:, self._marks, None], columns[:, None, self._marks]
+        own = (first == second).any(axis=(1, 2))
+        rows, columns, blocks = rows[own], columns[own], blocks[own]
         meet = rows[:, :, None] == columns[:, None, :]
         at = np.broadcast_to(rows[:, :, None], blocks.shape)[meet]
         return np.asarray(2.0 * np.bincount(at, blocks[meet], size + 1)[:size])
@@ -66,11 +69,12 @@ class PairMatrix:
         row, column = (padded[each[:, self._marks].clip(max=size)] for each in (rows, columns))
         first = np.repeat(row, len(self._marks), axis=1).ravel()
         second = np.tile(column, len(self._marks)).ravel()
-        pairs = distinct(np.concatenate([first * (num + 1) + second, second * (num + 1) + first]))
-        row, column = np.divmod(pairs, num + 1)
-        real = (row < num) & (column < num)
-        entries = np.ones(int(real.sum())), (row[real], column[real])
-        return sparse.coo_array(entries, shape=(num, num)).tocsr()
+        real = (first < num) & (second < num)
+        first, second = first[real], second[real]
+        places = np.concatenate([first, second]), np.concatenate([second, first])
+        found = sparse.coo_array((np.ones(2 * first.size), places), shape=(num, num)).tocsr()
+        found.data[:] = 1.0  # some couple more than once
+        return found
 
 
 Symmetric: TypeAlias = sparse.csr_array | PairMatrix

@@ -42,8 +42,8 @@ def times_blocks(given: Blocks, values: FloatArray) -> FloatArray | None:
         return None
     count = values.shape[1]
     checked, out = doubles(values, (given.size, count)), np.empty((given.size, count))
-    function(given.size, *given.blocks.shape, *given[1:], count, checked, out)
-    return out
+    status = function(given.size, *given.blocks.shape, *given[1:], count, checked, out)
+    return out if status == _DONE else None
 
 
 class BandPlaces(NamedTuple):

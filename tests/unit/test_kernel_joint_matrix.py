@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from sfm_audit.audit.joint.matrix import PairMatrix, operator_of
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
@@ -29,16 +29,49 @@ def test_blocks_make_the_symmetric_matrix_that_scipy_makes(size):
     np.add.at(expected, (rows[:, :, None], columns[:, None, :]), blocks)
     expected = (expected + expected.T)[:size, :size]
     given = checked_blocks(Blocks(size, rows, columns, blocks))
-    values = rng.normal(size=(size, 3))
-    assert_allclose(times_blocks(given, values), expected @ values, atol=1e-13)
+    values = rng.normal(size=(size, 13))
+    for some in (values[:, :1], values[:, :3], values[:, :8], values):
+        assert_allclose(times_blocks(given, some), expected @ some, atol=1e-13)
     matrix = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
-    assert_allclose(matrix.diagonal(), expected.diagonal(), atol=1e-13)
     assert_allclose(operator_of(matrix) @ values[:, 0], expected @ values[:, 0], atol=1e-13)
     with numpy_only():
         assert times_blocks(given, values) is None
         alone = PairMatrix(Blocks(size, rows, columns, blocks), np.arange(size), (0, 1, 2))
         assert_allclose(alone.toarray(), expected, atol=1e-13)
         assert_allclose(alone @ values, expected @ values, atol=1e-13)
+
+
+def test_what_a_block_has_in_a_place_that_is_padding_counts_for_nothing():
+    rows = columns = np.array([[0, 1, 2]])
+    blocks = np.full((1, 3, 3), np.nan)
+    blocks[0, :2, :2] = [[1.0, 2.0], [3.0, 4.0]]
+    for count in (1, 2):
+        found = times_blocks(checked_blocks(Blocks(2, rows, columns, blocks)), np.ones((2, count)))
+        assert_allclose(found, np.repeat([[7.0], [13.0]], count, axis=1))
+
+
+def test_the_diagonal_is_what_stands_at_equal_rows_and_columns():
+    """Poses of three columns and cameras of two, the first of which two images share; a column that nothing has."""
+    of_image = np.array([[0, 1, 2, 9, 10], [3, 4, 5, 9, 10], [6, 7, 8, 11, 13]])
+    rng, (first, second) = np.random.default_rng(1), np.array([[0, 0, 1, 2, 2], [0, 1, 1, 1, 2]])
+    blocks = rng.normal(size=(5, 5, 5))
+    expected = np.zeros((14, 14))
+    np.add.at(expected, (of_image[first][:, :, None], of_image[second][:, None, :]), blocks)
+    expected = (expected + expected.T)[:13, :13]
+    group = np.repeat(np.arange(6), [3, 3, 3, 2, 1, 1])
+    matrix = PairMatrix(Blocks(13, of_image[first], of_image[second], blocks), group, (0, 3))
+    assert_allclose(matrix.diagonal(), expected.diagonal(), atol=1e-15)
+    assert matrix.diagonal()[12] == 0.0
+    couples = np.zeros((6, 6))
+    couples[group[:, None], group] = expected != 0
+    assert_array_equal(matrix.pattern().toarray(), couples)
+
+
+def test_blocks_that_are_too_wide_are_left_to_scipy():
+    given = Blocks(40, np.arange(2)[None], np.arange(40)[None], np.ones((1, 2, 40)))
+    assert times_blocks(checked_blocks(given), np.ones((40, 1))) is None
+    matrix = PairMatrix(given, np.arange(40), (0,))
+    assert_allclose(matrix @ np.ones((40, 1)), matrix.toarray().sum(axis=1)[:, None])
 
 
 def test_blocks_of_another_matrix_or_band_never_reach_the_kernel():
