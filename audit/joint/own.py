@@ -100,84 +100,100 @@ def own_parameters(
     missing = [camera for camera in cameras if camera not in covariances]
     found = system.covariances([layout.own_of_camera(camera) for camera in missing])
     covariances.update(zip(missing, found, strict=True))
-    gains = _gains_of_cameras(system, cameras)
-    return tuple(_camera_step(system, camera, covariances[camera], gains[camera]) for camera in cameras)
+    steps: dict[int, CameraStep] = {}
+    for alike in _alike(system, cameras):
+        of_alike = np.stack([covariances[camera] for camera in alike])
+        steps.update(zip(alike, _camera_steps(system, alike, of_alike), strict=True))
+    return tuple(steps[camera] for camera in cameras)
 
 
-def _gains_of_cameras(system: JointSystem, cameras: Sequence[int]) -> dict[int, tuple[float, float]]:
-    """What either step of each camera's own parameters gains, in units of the noise squared."""
-    own = {camera: system.observations.layout.own_of_camera(camera) for camera in cameras}
-    out: dict[int, tuple[float, float]] = {}
-    for num in {columns.size for columns in own.values()}:
-        alike = [camera for camera in cameras if own[camera].size == num]
-        columns = np.stack([own[camera] for camera in alike]).astype(np.int64)
-        gains = (walds(system, columns, step[columns]).tolist() for step in (system.base.step, system.plain_step))
-        out.update(zip(alike, zip(*gains, strict=True), strict=True))
-    return out
+def _alike(system: JointSystem, cameras: Sequence[int]) -> list[list[int]]:
+    """Cameras of one model together, which have the same own parameters."""
+    models: dict[int, list[int]] = {}
+    for camera, model in zip(cameras, system.model.cameras.model_id[list(cameras)].tolist(), strict=True):
+        models.setdefault(model, []).append(camera)
+    return list(models.values())
 
 
-def _camera_step(
-    system: JointSystem, camera_idx: int, covariance: FloatArray, gains: tuple[float, float]
-) -> CameraStep:
-    observations, layout = system.observations, system.observations.layout
-    camera = system.model.camera(camera_idx)
-    columns, params = layout.own_of_camera(camera_idx), list(layout.own_param_idxs[camera_idx])
-    images = layout.images_of_camera(camera_idx)
-    n = int(np.diff(observations.offsets)[images].sum())
-    sigma_px = median_of(observations.sigma_px, images)
+def _camera_steps(system: JointSystem, cameras: Sequence[int], covariances: FloatArray) -> list[CameraStep]:
+    """The steps of cameras of one model; covariances (B, q, q) of their own parameters."""
+    observations, layout, records = system.observations, system.observations.layout, map(system.model.camera, cameras)
+    model, params = system.model.camera(cameras[0]).model, list(layout.own_param_idxs[cameras[0]])
+    every_param = np.stack([record.params for record in records])
+    columns = np.stack([layout.own_of_camera(camera) for camera in cameras]).astype(np.int64)
     step, plain = system.base.step[columns], system.plain_step[columns]
-    sd = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    focals = [params.index(i) for i in camera.model.focal_idxs]
-    sd_focal_rel = _sd_focal_rel(covariance[np.ix_(focals, focals)], camera.params[list(camera.model.focal_idxs)])
-    px = [sigma_px * math.sqrt(gain / n) if n else math.nan for gain in gains]
-    return CameraStep(
-        camera_idx,
-        images,
-        n,
-        tuple(camera.model.param_names[i] for i in params),
-        camera.params[params],
-        step,
-        sd,
-        plain,
-        px[0],
-        px[1],
-        sd_focal_rel,
-        bool(not focals or math.isfinite(sd_focal_rel)),
-        _implied(
-            system, images, camera.params[params] + step, [params.index(i) for i in camera.model.focal_idxs], step
-        ),
-        _correlation(covariance, sd),
-        sigma_px,
-    )
+    images = _images_of(layout.camera_idx, cameras)
+    counts = np.diff(observations.offsets)
+    num = np.array([counts[own].sum() for own in images])
+    sigma_px = np.array([median_of(observations.sigma_px, own) for own in images])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        px, plain_px = (
+            np.where(num > 0, sigma_px * np.sqrt(walds(system, columns, each) / num), math.nan).tolist()
+            for each in (step, plain)
+        )
+    sd = np.sqrt(np.maximum(np.einsum("bii->bi", covariances), 0.0))
+    focals = [params.index(i) for i in model.focal_idxs]
+    sd_focal_rel = _sd_focal_rel(covariances[:, focals][:, :, focals], every_param[:, list(model.focal_idxs)]).tolist()
+    stored, correlation = every_param[:, params], _correlation(covariances, sd)
+    return [
+        CameraStep(
+            camera,
+            images[k],
+            int(num[k]),
+            tuple(model.param_names[i] for i in params),
+            stored[k],
+            step[k],
+            sd[k],
+            plain[k],
+            px[k],
+            plain_px[k],
+            sd_focal_rel[k],
+            bool(not focals or math.isfinite(sd_focal_rel[k])),
+            _implied(system, images[k], stored[k] + step[k], step[k], focals),
+            correlation[k],
+            float(sigma_px[k]),
+        )
+        for k, camera in enumerate(cameras)
+    ]
+
+
+def _images_of(camera_idx: IntArray, cameras: Sequence[int]) -> list[IntArray]:
+    """The images of each of some cameras, ascending."""
+    order = np.argsort(camera_idx, kind="stable")
+    ordered = camera_idx[order]
+    first, last = (np.searchsorted(ordered, cameras, side=side).tolist() for side in ("left", "right"))
+    return [order[start:stop] for start, stop in zip(first, last, strict=True)]
 
 
 def _correlation(covariance: FloatArray, sd: FloatArray) -> FloatArray:
-    """Return the correlations (q, q) of a covariance, NaN where a standard deviation is not known or zero."""
+    """Correlations (B, q, q) of covariances, NaN where a standard deviation is not known or zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        scaled = covariance / sd / sd[:, None]
+        scaled = covariance / sd[:, None, :] / sd[:, :, None]
     known = (sd > 0) & np.isfinite(sd)
-    return np.where(known & known[:, None], scaled, math.nan)
+    return np.where(known[:, None, :] & known[:, :, None], scaled, math.nan)
 
 
-def _sd_focal_rel(covariance: FloatArray, focals: FloatArray) -> float:
-    """Return sd_f / |f| from the covariance (k, k) of k focal lengths, NaN without any.
+def _sd_focal_rel(covariance: FloatArray, focals: FloatArray) -> FloatArray:
+    """sd_f / |f| (B,) from the covariances (B, k, k) of k focal lengths each, NaN without any.
 
     Two focal lengths are one lens: what is asked is how well its focal length is known, pixels taken as square as
     stored. A forward sequence leaves fy open to 0.9 % and fx to 0.1 %; its focal length is known to 0.1 %, and
     own_fy_sd says the rest.
     """
-    if not focals.size or not np.isfinite(covariance).all():
-        return math.nan
-    relative = covariance / focals / focals[:, None]
-    if focals.size == 1:
-        return math.sqrt(max(float(relative[0, 0]), 0.0))
-    one = np.ones(focals.size)
-    information = float(one @ np.linalg.pinv(relative, hermitian=True) @ one)
-    return 1.0 / math.sqrt(information) if information > 0 else math.nan
+    out = np.full(len(focals), math.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2)) & (focals.shape[1] > 0)
+    relative = covariance[known] / focals[known][:, None, :] / focals[known][:, :, None]
+    if focals.shape[1] == 1:
+        out[known] = np.sqrt(np.maximum(relative[:, 0, 0], 0.0))
+    elif known.any():
+        information = np.linalg.pinv(relative, hermitian=True).sum(axis=1).sum(axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            out[known] = np.where(information > 0, 1.0 / np.sqrt(information), math.nan)
+    return out
 
 
 def _implied(
-    system: JointSystem, images: IntArray, values: FloatArray, focals: list[int], step: FloatArray
+    system: JointSystem, images: IntArray, values: FloatArray, step: FloatArray, focals: list[int]
 ) -> FloatArray:
     """Implied values, (q,); focal lengths that move by more than a percent are corrected for the step's curvature."""
     out = values.copy()
