@@ -66,6 +66,7 @@ class Points:
         Then what the points' steps remove of the sum of squares, and that sum.
 
         observations : as `sums` got them        limits : min_track_length, min_eigenvalue
+        used : (n,) may be the memory of what is verified
         out : whitened (2, n) px and verified (n,), see `audit.noise.tracks.TrackStatistics`
         """
         residuals_px, point_jacobian, point_idx = observations

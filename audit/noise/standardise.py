@@ -80,8 +80,7 @@ def model_tracks(
     moved = residuals.pose_offset_px > pose_offset_threshold_px
     num_audited = int(np.count_nonzero(np.diff(residuals.offsets)))
     too_many = bool(2 * np.count_nonzero(moved) > num_audited)
-    left_out = np.zeros_like(moved) if too_many else moved
-    own_left_out = np.repeat(left_out, np.diff(residuals.offsets))
+    own_left_out = None if too_many or not moved.any() else np.repeat(moved, np.diff(residuals.offsets))
     statistics = track_statistics(
         residuals.residuals_px,
         residuals.point_jacobian,
@@ -91,7 +90,7 @@ def model_tracks(
         min_eigenvalue=min_eigenvalue,
         left_out=own_left_out,
     )
-    used = statistics.verified & ~own_left_out
+    used = statistics.verified if own_left_out is None else statistics.verified & ~own_left_out
     prior = fit_prior_of_tracks(statistics, used)
     standardiser = None
     if math.isfinite(prior.nu0):

@@ -107,8 +107,8 @@ def _compiled(
     residuals_px, point_jacobian = (np.ascontiguousarray(array) for array in observations[:2])
     n = observations[2].size
     point_idx = small_ints(observations[2], n)
-    used = [np.ones(n, dtype=np.bool_)] + ([] if left_out is None else [~left_out])
-    out = np.empty((2, n)), np.empty(n, dtype=np.bool_)
+    out = np.empty((2, n)), np.ones(n, dtype=np.bool_)
+    used = [out[1], *([] if left_out is None else [~left_out])]  # all: what is verified is written where it was read
     removable = total = 0.0
     tables: list[TrackTable] = []
     for rows in used:  # the second writes over what the first said of them
