@@ -15,8 +15,8 @@ from sfm_audit.audit.calibrate.validation import Validation, degenerate_judgemen
 from sfm_audit.audit.decision.columns import cause_columns
 from sfm_audit.audit.engine.rows import misfit_columns, normality_columns
 from sfm_audit.audit.normality import NormalityTests
-from sfm_audit.audit.table import schema
-from sfm_audit.audit.table.arrow import Coded, Values, build_table
+from sfm_audit.audit.table import build_table, schema
+from sfm_audit.audit.table.given import Coded, Values
 from sfm_audit.audit.table.words import Member, Verdict
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.correspondences.records import Correspondences

@@ -11,7 +11,7 @@ from sfm_audit.audit.decision.decisions import MEMBERS, Decisions, Reasons, deci
 from sfm_audit.audit.decision.judged import VERDICTS
 from sfm_audit.audit.decision.misfit import MisfitDecision
 from sfm_audit.audit.decision.severity import SEVERITIES
-from sfm_audit.audit.table.arrow import Coded, Column, Listed, Structs
+from sfm_audit.audit.table.given import Coded, Column, Listed, Structs
 from sfm_audit.audit.table.words import GROUPS, PolicyName
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 

@@ -22,7 +22,7 @@ from sfm_audit.audit.decision.diagnostics import Diagnostics
 from sfm_audit.audit.decision.from_row import READ_COLUMNS, diagnostics_of_row, number_of
 from sfm_audit.audit.decision.measured import Measured
 from sfm_audit.audit.table import build_table
-from sfm_audit.audit.table.arrow import Column
+from sfm_audit.audit.table.given import Column
 from sfm_audit.audit.table.words import GROUPS, Member, MisfitStatus
 from sfm_audit.loaders.arrays import BoolArray
 

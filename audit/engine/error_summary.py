@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.kernels.errors import error_summaries
-from sfm_audit.audit.table.arrow import Column
+from sfm_audit.audit.table.given import Column
 from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _COLUMNS: Final = ("rms_px", "mean_px", "median_px", "p95_px", "max_px")

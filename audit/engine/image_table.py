@@ -21,8 +21,8 @@ from sfm_audit.audit.engine.jointly import pose_columns
 from sfm_audit.audit.engine.known import ModelFacts, sizes_px
 from sfm_audit.audit.engine.noise_columns import NoiseColumns
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.audit.table.arrow import Coded, Column, Listed, Structs
 from sfm_audit.audit.table.columns import IMPLIED, OUTSIDE_COLUMNS, own_parameter_names
+from sfm_audit.audit.table.given import Coded, Column, Listed, Structs
 from sfm_audit.audit.table.pose_columns import POSE_COLUMNS
 from sfm_audit.audit.table.words import GROUPS
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, Int32Array, IntArray

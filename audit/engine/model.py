@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 from threadpoolctl import threadpool_limits
 
 from sfm_audit.audit.camera_quality.measure import CameraQuality
@@ -57,6 +56,9 @@ from sfm_audit.audit.witnesses.evidence import Evidence
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.evidence import NOTHING_GIVEN, Given
 from sfm_audit.loaders.model import CameraRecord, InlierSet, SparseModel
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 class ModelAuditor:

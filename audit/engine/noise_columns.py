@@ -14,7 +14,7 @@ from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.noise.stack import ConstantFits, constant_noises, track_noises
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks
 from sfm_audit.audit.normality import normality_columns_of
-from sfm_audit.audit.table.arrow import Column
+from sfm_audit.audit.table.given import Column
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 _MAX_INLIERS_AT_ONCE: Final = 1 << 17

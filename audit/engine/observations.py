@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
 
 from sfm_audit.audit.inliers.residuals import ModelResiduals
-from sfm_audit.audit.table import ModelLabels, schema
-from sfm_audit.audit.table.arrow import Coded, build_table
+from sfm_audit.audit.table import ModelLabels, build_table, schema
+from sfm_audit.audit.table.given import Coded
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 from sfm_audit.loaders.model import SparseModel
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 Standardised = Callable[[int], tuple[IntArray, FloatArray]]
 """From an image's row to the rows (m,) among its inliers that have a z, and their z (m, 2)."""

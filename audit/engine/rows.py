@@ -18,8 +18,8 @@ from sfm_audit.audit.misfit import GROUPS, MisfitTests
 from sfm_audit.audit.noise.standardise import ModelTracks
 from sfm_audit.audit.normality import NormalityTests
 from sfm_audit.audit.table import ModelLabels
-from sfm_audit.audit.table.arrow import Coded, Column, Listed
 from sfm_audit.audit.table.columns import IMPLIED
+from sfm_audit.audit.table.given import Coded, Column, Listed
 from sfm_audit.audit.table.witnesses import Witness
 from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.model import Finding, SparseModel

@@ -5,10 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import pyarrow as pa
 
 from sfm_audit.audit.decision.decisions import MEMBERS, Decisions
 from sfm_audit.audit.decision.judged import VERDICTS
@@ -16,9 +15,12 @@ from sfm_audit.audit.decision.triage import IMAGE_COLUMNS
 from sfm_audit.audit.engine.image_table import KnownImages
 from sfm_audit.audit.misfit.multiplicity import benjamini_hochberg
 from sfm_audit.audit.table import ColumnGroup, build_table, empty_table, schema
-from sfm_audit.audit.table.arrow import Coded, Column, Listed
+from sfm_audit.audit.table.given import Coded, Column, Listed
 from sfm_audit.audit.table.words import VERDICT_ORDER, ReasonCode, Verdict
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _REJECTED: Final = VERDICT_ORDER[Verdict.REJECTED]
 
@@ -124,6 +126,8 @@ def images_table(parts: Sequence[ImagesPart], groups: Sequence[ColumnGroup] = ()
     """Return the table of images; q-values need all of a model. groups: columns that only some runs have."""
     if not sum(part.table.num_rows for part in parts):
         return empty_table("images", groups)
+    import pyarrow as pa  # noqa: PLC0415 - nothing needs it before a table is made
+
     tables = [part.table for part in parts]
     table = tables[0] if len(tables) == 1 else pa.concat_tables(tables).combine_chunks()
     at = table.column_names.index("ks_q")

@@ -7,54 +7,19 @@ built from buffers do not.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Coded:
-    """A column of few different texts: ``names[codes[i]]`` in row i; None there is null."""
-
-    codes: npt.NDArray[Any]
-    names: Sequence[str | None]
-
-    def __len__(self) -> int:
-        return len(self.codes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Listed:
-    """A column of lists: row i holds ``items[offsets[i]:offsets[i + 1]]``, or null where ``known`` (n,) says so."""
-
-    offsets: npt.NDArray[Any]
-    items: Column
-    known: npt.NDArray[np.bool_] | None = None
-
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Structs:
-    """A column of structs, field by field."""
-
-    fields: Mapping[str, Column]
-
-    def __len__(self) -> int:
-        return len(next(iter(self.fields.values())))
-
+from sfm_audit.audit.table.given import Coded, Column, Listed, Structs, Values
 
 _FLOATS: Final = frozenset({float, np.float64, type(None)})
 _DOUBLE: Final = pa.float64()
 _FEW_ROWS: Final = 1 << 11  # 4 MB of the images table: columns of more rows are not copied
 _MANY_SCHEMAS: Final = 64
 _known_kinds: Final[dict[int, tuple[pa.Schema, list[tuple[str, pa.DataType]]]]] = {}
-Values = npt.NDArray[Any] | Sequence[Any]
-Column = Values | Coded | Listed | Structs
 
 
 def build_table(columns: Mapping[str, Column], wanted: pa.Schema) -> pa.Table:

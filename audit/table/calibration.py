@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-import pyarrow as pa
-
 from sfm_audit.audit.table.kinds import (
-    CODED_TEXT,
     REASON_DETAIL,
     Column,
     count,
     flag,
-    list_of,
     misfit_groups,
     number,
     px,
     text,
     texts,
 )
+from sfm_audit.audit.table.types import CODED_TEXT, DOUBLE, INT64, UINT32, list_of
 
 CALIBRATION: Final[tuple[Column, ...]] = (
     text("correspondences", "location of the correspondences as given"),
@@ -27,10 +24,10 @@ CALIBRATION: Final[tuple[Column, ...]] = (
         "distortion", "forward: distorted = undistorted (1 + k1 r^2 ...); division: undistorted = distorted / (1 + ...)"
     ),
     text("camera_model", "COLMAP's name of the same camera; null where COLMAP has none"),
-    Column("params", list_of(pa.float64()), "px and 1", "parameters of camera_model, in COLMAP's order"),
+    Column("params", list_of(DOUBLE), "px and 1", "parameters of camera_model, in COLMAP's order"),
     texts("estimated", "parameters that were estimated beside the pose; f moves fx and fy alike"),
-    Column("width", pa.uint32(), "px", "image width"),
-    Column("height", pa.uint32(), "px", "image height"),
+    Column("width", UINT32, "px", "image width"),
+    Column("height", UINT32, "px", "image height"),
     px("fx_px", "focal length in x"),
     px("fy_px", "focal length in y"),
     px("cx_px", "principal point; the centre of the first pixel is 0.5"),
@@ -38,8 +35,8 @@ CALIBRATION: Final[tuple[Column, ...]] = (
     number("k1", "first coefficient of the distortion; which way it acts says distortion"),
     number("k2", "second coefficient of the distortion"),
     number("k3", "third coefficient of the distortion"),
-    Column("rotation_cam_from_world", list_of(pa.float64()), "1", "nine numbers, row by row"),
-    Column("translation_cam_from_world", list_of(pa.float64()), "model units", "three numbers"),
+    Column("rotation_cam_from_world", list_of(DOUBLE), "1", "nine numbers, row by row"),
+    Column("translation_cam_from_world", list_of(DOUBLE), "model units", "three numbers"),
     count("num_correspondences", "correspondences given"),
     count("num_inliers", "correspondences that the estimator kept; all that follows is about them"),
     px("rms_px", "root mean square reprojection error, sqrt(mean |eps|^2)"),
@@ -83,7 +80,7 @@ CALIBRATION: Final[tuple[Column, ...]] = (
     number("correlation_focal_depth", "correlation of the focal length with the distance; +-1: not told apart"),
     number("singular_share", "smallest / largest singular value of the unit Jacobian columns; ~0: ill-conditioned"),
     number("planarity", "smallest / largest singular value of the centred 3D points; 0: on a plane"),
-    Column("plane_tilt_deg", pa.float64(), "deg", "angle of the points' plane with the image; 0: fronto-parallel"),
+    Column("plane_tilt_deg", DOUBLE, "deg", "angle of the points' plane with the image; 0: fronto-parallel"),
     number("coverage", "area of the convex hull of the observed inliers / image area, not clipped"),
     count("occupied_cells", "cells with at least one inlier, of an 8 x 8 grid over the image"),
     number("focal_over_size", "first focal length / max(width, height)"),
@@ -101,7 +98,7 @@ CALIBRATION: Final[tuple[Column, ...]] = (
 
 CALIBRATION_RESIDUALS: Final[tuple[Column, ...]] = (
     Column("model", CODED_TEXT, "text", "estimator and model, as in calibration"),
-    Column("correspondence_idx", pa.int64(), "id", "position among the correspondences as given, from 0"),
+    Column("correspondence_idx", INT64, "id", "position among the correspondences as given, from 0"),
     flag("is_inlier", "whether the estimator kept it"),
     px("x_px", "observed; the centre of the first pixel is 0.5"),
     px("y_px", "observed; the centre of the first pixel is 0.5"),

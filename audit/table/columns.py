@@ -9,22 +9,17 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-import pyarrow as pa
-
-from sfm_audit.audit.table.arrow import build_table
 from sfm_audit.audit.table.calibration import CALIBRATION, CALIBRATION_RESIDUALS
 from sfm_audit.audit.table.diagnoses import DIAGNOSIS
 from sfm_audit.audit.table.kinds import (
-    CODED_TEXT,
     MISFIT_DETAIL,
     REASON_DETAIL,
     TESTIMONY,
     Column,
     count,
     flag,
-    list_of,
     misfit,
     number,
     px,
@@ -33,8 +28,16 @@ from sfm_audit.audit.table.kinds import (
     texts,
 )
 from sfm_audit.audit.table.pose_columns import POSE
+from sfm_audit.audit.table.types import CODED_TEXT, DOUBLE, INT64, TEXT, UINT32, UINT64, list_of, struct_of
 from sfm_audit.audit.table.words import GROUP_MEANINGS, Member, Verdict
 from sfm_audit.loaders.camera_models import CAMERA_MODELS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import pyarrow as pa
+
+    from sfm_audit.audit.table.given import Column as Given
 
 __all__ = [
     "CALIBRATION",
@@ -88,7 +91,7 @@ def _joint_misfit() -> tuple[Column, ...]:
             "misfit_details", list_of(MISFIT_DETAIL), "text", "every group in the joint test: status, BIC gain, worth"
         ),
         number("misfit_px_sigma", "misfit_px / sigma_constant_px"),
-        Column("misfit_worth_deg", pa.float64(), "deg", "rotation of the image if misfit_group were admitted"),
+        Column("misfit_worth_deg", DOUBLE, "deg", "rotation of the image if misfit_group were admitted"),
         number("misfit_worth_centre", "shift of its centre then, in units of the median depth"),
         number("misfit_worth_focal_rel", "relative change of its focal length then"),
     )
@@ -142,7 +145,7 @@ GROUP_COLUMNS: Final[dict[ColumnGroup, tuple[Column, ...]]] = {
     "reference": (
         number("reference_centre_error", "distance of its centre from the reference's, in units of the reference"),
         number("reference_centre_rel", "the same in median depths of the model"),
-        Column("reference_rotation_deg", pa.float64(), "deg", "angle between its rotation and the reference's"),
+        Column("reference_rotation_deg", DOUBLE, "deg", "angle between its rotation and the reference's"),
         count("reference_fragment", "0 the main group, 1.. images that moved together; null alone or not known"),
     ),
     "priors": (
@@ -154,7 +157,7 @@ GROUP_COLUMNS: Final[dict[ColumnGroup, tuple[Column, ...]]] = {
 }
 """Columns of the images table that exist only where a reference (--reference) or priors (--priors) were given."""
 
-OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.type == pa.float64() else None for column in _OUTSIDE}
+OUTSIDE_COLUMNS: Final = {column.name: math.nan if column.kind == DOUBLE else None for column in _OUTSIDE}
 """What witnesses outside of the image measure, and what stands there where they measured nothing."""
 
 IMAGES: Final[tuple[Column, ...]] = (
@@ -163,9 +166,9 @@ IMAGES: Final[tuple[Column, ...]] = (
     text("image_name", "name as stored"),
     stored_id("camera_id", "id as stored"),
     text("camera_model", "COLMAP's name of the camera model; null when the model has no such camera"),
-    Column("width", pa.uint32(), "px", "image width as stored with the camera"),
-    Column("height", pa.uint32(), "px", "image height as stored with the camera"),
-    Column("params", list_of(pa.float64()), "px and 1", "camera parameters as stored, in COLMAP's order"),
+    Column("width", UINT32, "px", "image width as stored with the camera"),
+    Column("height", UINT32, "px", "image height as stored with the camera"),
+    Column("params", list_of(DOUBLE), "px and 1", "camera parameters as stored, in COLMAP's order"),
     *(number(f"q{axis}", f"{axis} of the rotation camera from world, a quaternion as stored") for axis in "wxyz"),
     *(number(f"t{axis}", f"{axis} of the translation camera from world, model units") for axis in "xyz"),
     number("median_depth", "median depth of the inliers, model units"),
@@ -259,9 +262,9 @@ CAMERAS: Final[tuple[Column, ...]] = (
     *_IDENTITY,
     stored_id("camera_id", "id as stored"),
     text("camera_model", "COLMAP's name of the camera model"),
-    Column("width", pa.uint32(), "px", "image width as stored"),
-    Column("height", pa.uint32(), "px", "image height as stored"),
-    Column("params", list_of(pa.float64()), "px and 1", "camera parameters as stored, in COLMAP's order"),
+    Column("width", UINT32, "px", "image width as stored"),
+    Column("height", UINT32, "px", "image height as stored"),
+    Column("params", list_of(DOUBLE), "px and 1", "camera parameters as stored, in COLMAP's order"),
     count("num_images", "images of this camera with inliers"),
     count("num_points3d", "3D points that they see"),
     count("num_observations", "their inliers"),
@@ -270,7 +273,7 @@ CAMERAS: Final[tuple[Column, ...]] = (
     texts("own_parameters", "its own parameters, those that COLMAP refines; null where it takes no part"),
     Column(
         "own_correlations",
-        list_of(pa.float64()),
+        list_of(DOUBLE),
         "1",
         "correlations of own_parameters in the joint system, below the diagonal, row by row",
     ),
@@ -280,7 +283,7 @@ CAMERAS: Final[tuple[Column, ...]] = (
     flag("misfit_material", "whether misfit_group has q < alpha and an effect above min_effect"),
 )
 
-_FINDING: Final = pa.struct([("code", pa.string()), ("count", pa.int64()), ("text", pa.string())])
+_FINDING: Final = struct_of(code=TEXT, count=INT64, text=TEXT)
 
 _ORDER_OF_COUNTS: Final = (  # the first four as version 0.1.0 has them
     *(Member.KS, Member.MISFIT, Member.POSE, Member.PLAUSIBLE),
@@ -327,8 +330,8 @@ OBSERVATIONS: Final[tuple[Column, ...]] = (
     *(Column(column.name, CODED_TEXT, column.unit, column.meaning) for column in _IDENTITY),
     stored_id("image_id", "id as stored"),
     Column("image_name", CODED_TEXT, "text", "name as stored"),
-    Column("point2d_idx", pa.int64(), "id", "position among the image's 2D points as stored, from 0"),
-    Column("point3d_id", pa.uint64(), "id", "id of its 3D point as stored"),
+    Column("point2d_idx", INT64, "id", "position among the image's 2D points as stored, from 0"),
+    Column("point3d_id", UINT64, "id", "id of its 3D point as stored"),
     px("x_px", "observed; the centre of the first pixel is 0.5"),
     px("y_px", "observed; the centre of the first pixel is 0.5"),
     px("residual_x_px", "observed - projected"),
@@ -362,7 +365,16 @@ def _schema(table: TableName, groups: frozenset[ColumnGroup]) -> pa.Schema:
         *TABLES[table],
         *(column for group in GROUP_COLUMNS if group in groups for column in GROUP_COLUMNS[group]),
     ]
+    import pyarrow as pa  # noqa: PLC0415 - nothing needs it before a table is made
+
     return pa.schema([pa.field(column.name, column.type, metadata=column.metadata) for column in columns])
+
+
+def build_table(columns: Mapping[str, Given], wanted: pa.Schema) -> pa.Table:
+    """Build an Arrow table of a given schema, see `audit.table.arrow.build_table`."""
+    from sfm_audit.audit.table import arrow  # noqa: PLC0415 - nothing needs it before a table is made
+
+    return arrow.build_table(columns, wanted)
 
 
 def empty_table(table: TableName, groups: Collection[ColumnGroup] = ()) -> pa.Table:

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-import pyarrow as pa
-
-from sfm_audit.audit.table.kinds import list_of
+from sfm_audit.audit.table.types import INT64, TEXT, UINT32, list_of, struct_of
 
 
 class DiagnosisCode(StrEnum):
@@ -137,16 +135,14 @@ class Diagnosis:
     command: str
 
 
-DIAGNOSIS: Final = pa.struct(
-    [
-        ("code", pa.string()),
-        ("camera_id", pa.uint32()),
-        ("severity", pa.string()),
-        ("num_images", pa.int64()),
-        ("examples", list_of(pa.string())),
-        ("text", pa.string()),
-        ("action", pa.string()),
-        ("command", pa.string()),
-    ]
+DIAGNOSIS: Final = struct_of(
+    code=TEXT,
+    camera_id=UINT32,
+    severity=TEXT,
+    num_images=INT64,
+    examples=list_of(TEXT),
+    text=TEXT,
+    action=TEXT,
+    command=TEXT,
 )
 """A `Diagnosis` as the table has it."""

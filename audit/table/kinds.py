@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import pyarrow as pa
-
+from sfm_audit.audit.table.types import DOUBLE, FLAG, INT64, TEXT, UINT32, Kind, list_of, struct_of
 from sfm_audit.audit.table.words import GROUP_MEANINGS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,10 +20,15 @@ class Column:
     """
 
     name: str
-    type: pa.DataType
+    kind: Kind
     unit: str
     meaning: str
     gauge: str = ""
+
+    @property
+    def type(self) -> pa.DataType:
+        """Its type in Arrow tables."""
+        return self.kind.arrow
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -32,42 +39,37 @@ class Column:
 
 def text(name: str, meaning: str) -> Column:
     """Return a column of a text."""
-    return Column(name, pa.string(), "text", meaning)
-
-
-def list_of(kind: pa.DataType) -> pa.DataType:
-    """Return the type of a list, with the name of its element as Parquet has it."""
-    return pa.list_(pa.field("element", kind))  # Parquet's name for it: what is read equals what was written
+    return Column(name, TEXT, "text", meaning)
 
 
 def texts(name: str, meaning: str) -> Column:
     """Return a column of a list of texts."""
-    return Column(name, list_of(pa.string()), "text", meaning)
+    return Column(name, list_of(TEXT), "text", meaning)
 
 
 def stored_id(name: str, meaning: str) -> Column:
     """Return a column of an id as stored."""
-    return Column(name, pa.uint32(), "id", meaning)
+    return Column(name, UINT32, "id", meaning)
 
 
 def count(name: str, meaning: str) -> Column:
     """Return a column of a count."""
-    return Column(name, pa.int64(), "count", meaning)
+    return Column(name, INT64, "count", meaning)
 
 
 def flag(name: str, meaning: str) -> Column:
     """Return a column of a truth value."""
-    return Column(name, pa.bool_(), "bool", meaning)
+    return Column(name, FLAG, "bool", meaning)
 
 
 def px(name: str, meaning: str) -> Column:
     """Return a column of a length in pixels."""
-    return Column(name, pa.float64(), "px", meaning)
+    return Column(name, DOUBLE, "px", meaning)
 
 
 def number(name: str, meaning: str) -> Column:
     """Return a column of a pure number."""
-    return Column(name, pa.float64(), "1", meaning)
+    return Column(name, DOUBLE, "1", meaning)
 
 
 def misfit_groups() -> tuple[Column, ...]:
@@ -93,41 +95,13 @@ def misfit() -> tuple[Column, ...]:
     )
 
 
-REASON_DETAIL: Final = pa.struct(
-    [
-        ("code", pa.string()),
-        ("verdict", pa.string()),
-        ("value", pa.float64()),
-        ("limit", pa.float64()),
-        ("unit", pa.string()),
-        ("group", pa.string()),
-        ("text", pa.string()),
-    ]
-)
+REASON_DETAIL: Final = struct_of(code=TEXT, verdict=TEXT, value=DOUBLE, limit=DOUBLE, unit=TEXT, group=TEXT, text=TEXT)
 """One reason: its code, the verdict it speaks for, the number that triggered it, its limit, and the same in words."""
 
-MISFIT_DETAIL: Final = pa.struct(
-    [
-        ("group", pa.string()),
-        ("status", pa.string()),
-        ("gain", pa.float64()),
-        ("worth_deg", pa.float64()),
-        ("worth_centre", pa.float64()),
-        ("worth_focal_rel", pa.float64()),
-    ]
+MISFIT_DETAIL: Final = struct_of(
+    group=TEXT, status=TEXT, gain=DOUBLE, worth_deg=DOUBLE, worth_centre=DOUBLE, worth_focal_rel=DOUBLE
 )
 """One group in the joint test: why it has a q, or why not, BIC gain, and what admitting it would do to the image."""
 
-TESTIMONY: Final = pa.struct(
-    [
-        ("witness", pa.string()),
-        ("score", pa.float64()),
-        ("limit", pa.float64()),
-        ("q", pa.float64()),
-        ("unit", pa.string()),
-        ("text", pa.string()),
-    ]
-)
+TESTIMONY: Final = struct_of(witness=TEXT, score=DOUBLE, limit=DOUBLE, q=DOUBLE, unit=TEXT, text=TEXT)
 """What one witness says of an image: it disagrees where score is above limit and q, where it has one, below alpha."""
-
-CODED_TEXT: Final = pa.dictionary(pa.int32(), pa.string())  # millions of rows, few different texts

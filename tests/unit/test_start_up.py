@@ -58,6 +58,16 @@ def test_an_audit_imports_only_what_it_uses():
     assert not ended.stdout.split()
 
 
+def test_arrow_is_imported_when_a_table_is_made():
+    ask = (
+        "import sys, sfm_audit.audit.engine.model, sfm_audit.loaders; print('pyarrow' in sys.modules)\n"
+        "from sfm_audit.audit.table import IMAGES, empty_table\n"
+        "print(len(IMAGES) > 0, 'pyarrow' in sys.modules, empty_table('images').num_rows, 'pyarrow' in sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines() == ["False", "True False 0 True"]
+
+
 def test_scipy_copies_no_subpackage_of_numpy_that_nobody_uses():
     ask = (
         "import sys, numpy\n"
