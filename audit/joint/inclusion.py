@@ -12,7 +12,9 @@ import numpy as np
 from sfm_audit.audit.joint.candidates import FieldsInParts, ImageFields, scores_everywhere
 from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE, group_root
 from sfm_audit.audit.joint.neighbourhood import sum_by_track
+from sfm_audit.audit.joint.sums import joint_sums, moved_by
 from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
+from sfm_audit.audit.kernels.joint_inclusion import take_change
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 
 
@@ -67,7 +69,20 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
         columns = size + np.arange(starts[k], starts[k + 1])
         included[own.image_idx] = IncludedFields(own.image_idx, own.fields, columns)
     grown = replace(base, inverse=base.inverse.bordered(solution, root), included=included)
-    return with_step(grown, step)
+    return _with_change(base, grown, step)
+
+
+def _with_change(base: Base, grown: Base, step: FloatArray) -> Base:
+    """Return the grown base with another step than ``base`` had; only what changes is projected."""
+    observations = base.observations
+    sums = joint_sums(observations, base.left_px, observations.weight, base.point_inverse)
+    if sums is None:
+        return with_step(grown, step)
+    change = step.copy()
+    change[: base.step.size] -= base.step
+    fields = {image: extra.fields @ change[extra.columns] for image, extra in grown.included.items()}
+    found = take_change(sums, moved_by(observations, change), fields, base.point_step)
+    return with_step(grown, step) if found is None else replace(grown, step=step, point_step=found[0], left_px=found[1])
 
 
 def _independent(base: Base, candidate: Candidate) -> _New:
