@@ -60,9 +60,10 @@ def tests_of_sums(system: JointSystem, summed: Sequence[GroupSumsOfImage], alpha
     }
     asked = np.array([k for k, test in enumerate(told) if test.p < alpha], dtype=np.int64)
     image, group = images[asked // num], asked % num
-    depth = {i: system.median_depth(i) for i in dict.fromkeys(image.tolist())}
+    distinct, place = np.unique(image, return_inverse=True)
+    depth = system.median_depths(distinct)[place]
     change = numbers.change[places].reshape(len(told), -1)[asked]
-    worths = worths_of(system, image, change, np.array([depth[i] for i in image.tolist()]))
+    worths = worths_of(system, image, change, depth)
     for i, k, worth in zip(image.tolist(), group.tolist(), worths, strict=True):
         found[i][1][groups[k]] = worth
     return found

@@ -20,8 +20,9 @@ from sfm_audit.audit.joint.matrix import Symmetric, operator_of
 from sfm_audit.audit.joint.normal import ReducedSystem, off_points, point_steps, reduced_systems, score_meat
 from sfm_audit.audit.joint.observations import JointObservations, joint_observations
 from sfm_audit.audit.joint.sums import joint_sums, moved_by
+from sfm_audit.audit.kernels.joint_depths import median_depths
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
-from sfm_audit.loaders.model import SparseModel, rotation_from_quat
+from sfm_audit.loaders.model import SparseModel
 
 _DIRECT: Final = 1500  # columns up to which the plain step gets a factor of its own
 _COLUMNS_AT_ONCE: Final = 400
@@ -76,13 +77,22 @@ class JointSystem:
 
     def median_depth(self, image_idx: int) -> float:
         """Median depth of the points that an image sees in the system, model units."""
-        observations, images = self.observations, self.model.images
-        points = observations.points.take(observations.point_idx[observations.rows(image_idx)])
-        if not points.size:
-            return math.nan
-        axis = rotation_from_quat(images.quat_cam_from_world_wxyz[image_idx])[2]
-        depth = self.model.points.xyz_world.take(points, axis=0) @ axis
-        return float(np.median(depth) + images.translation_cam_from_world[image_idx, 2])
+        return float(self.median_depths(np.array([image_idx]))[0])
+
+    def median_depths(self, image_idxs: IntArray) -> FloatArray:
+        """(k,) the same of some images; NaN where an image sees none."""
+        observations, images, xyz_world = self.observations, self.model.images, self.model.points.xyz_world
+        poses = images.quat_cam_from_world_wxyz, images.translation_cam_from_world
+        compiled = median_depths(observations.index, image_idxs, observations.points, xyz_world, poses)
+        if compiled is not None:
+            return compiled
+        out = np.full(len(image_idxs), math.nan)
+        for k, image in enumerate(image_idxs.tolist()):
+            points = observations.points.take(observations.point_idx[observations.rows(image)])
+            if points.size:
+                moved = self.model.image(image).cam_from_world(xyz_world.take(points, axis=0))
+                out[k] = np.median(moved[:, 2])
+        return out
 
     def relief_change(self, image_idx: int) -> float:
         """By how much the step changes an image's depth relative to the relief of its points (relative change)."""
