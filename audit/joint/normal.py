@@ -39,9 +39,16 @@ class ReducedSystem:
     before: FloatArray
 
 
-def reduced_systems(observations: JointObservations) -> tuple[ReducedSystem, ReducedSystem]:
-    """Assemble (6) with the robust weights and with w = 1."""
-    values_px = observations.residuals_px()
+def reduced_systems(
+    observations: JointObservations, values_px: FloatArray | None = None
+) -> tuple[ReducedSystem, ReducedSystem]:
+    """Assemble (6) with the robust weights and with w = 1.
+
+    Parameters
+    ----------
+    values_px : (n, 2) residuals of the observations, where they are at hand
+    """
+    values_px = observations.residuals_px() if values_px is None else values_px
     compiled = _compiled_systems(observations, values_px)
     if compiled is not None:
         return compiled

@@ -143,12 +143,17 @@ class JointSystem:
         missing = [block for block, covariance in zip(blocks, found, strict=True) if covariance is None]
         others = _sandwiches(inverse.main, meat, missing)
         out = []
+        is_lost = bool(inverse.unidentified.any())
         for block, known in zip(blocks, found, strict=True):
-            covariance = next(others) if known is None else known
-            lost = inverse.unidentified[block]
-            covariance[lost] = np.nan
-            covariance[:, lost] = np.nan
-            out.append(0.5 * (covariance + covariance.T))
+            covariance = known
+            if covariance is None:
+                covariance = next(others)
+                covariance = 0.5 * (covariance + covariance.T)
+            if is_lost:
+                lost = inverse.unidentified[block]
+                covariance[lost] = np.nan
+                covariance[:, lost] = np.nan
+            out.append(covariance)
         return out
 
 
@@ -207,23 +212,29 @@ def joint_system(
         points_independent=points_independent,
     )
     gauge = gauge_directions(model, observations)
-    reduced, plain = reduced_systems(observations)
+    values_px = observations.residuals_px()
+    reduced, plain = reduced_systems(observations, values_px)
     point_inverse, plain = reduced.point_inverse, replace(plain, point_inverse=plain.point_inverse[:0])  # much memory
     inverse = joint_inverse(reduced.matrix, reduced.before, gauge)
     step = inverse.main.apply(reduced.right)
     plain_step = _plain_step(plain, inverse, step, gauge)
     del plain, reduced
     nothing = np.zeros((0, 3))
-    base = with_step(Base(observations, point_inverse, inverse, step, nothing, nothing[:, :2], {}), step)
+    base = with_step(Base(observations, point_inverse, inverse, step, nothing, nothing[:, :2], {}), step, values_px)
     return JointSystem(model, residuals, base, plain_step)
 
 
-def with_step(base: Base, step: FloatArray) -> Base:
-    """Return the base with y~ = y - N step - J point_step of (7)."""
+def with_step(base: Base, step: FloatArray, values_px: FloatArray | None = None) -> Base:
+    """Return the base with y~ = y - N step - J point_step of (7).
+
+    Parameters
+    ----------
+    values_px : (n, 2) y, where it is at hand and nobody else needs it: what is left is put there
+    """
     observations = base.observations
     padded = np.append(step[: observations.layout.num_columns], 0.0)
     layout, weight = observations.layout, observations.weight
-    left = observations.residuals_px()
+    left = observations.residuals_px() if values_px is None else values_px
     sums = joint_sums(observations, left, weight, base.point_inverse)
     if sums is not None:
         sums.subtract_step(moved_by(observations, step), left)
@@ -232,7 +243,7 @@ def with_step(base: Base, step: FloatArray) -> Base:
     for image, extra in base.included.items():
         left[observations.rows(image)] -= extra.fields @ step[extra.columns]
     if sums is not None:
-        moved, left = sums.off_points(left)
+        moved = sums.off_points(left)
         return replace(base, step=step, point_step=moved, left_px=left)
     moved = point_steps(observations, weight, base.point_inverse, left)
     left = off_points(observations, weight, base.point_inverse, left)

@@ -195,16 +195,15 @@ class JointSums:
         """Whether the views of an image's points are few enough to be held at once."""
         return bool(self.index.num_views[image_idx] <= _MOST_VIEWS)
 
-    def off_points(self, values_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (P, 3) V^-1 J^T w values, and (n, 2) the values minus what that removes."""
+    def off_points(self, values_px: FloatArray) -> FloatArray:
+        """Return (P, 3) V^-1 J^T w values; from the values (n, 2) what that removes is subtracted in place."""
         function = kernel("joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size)
-        if function is None or values_px.shape != self._held["left"].shape:
+        if function is None or values_px.shape != self._held["left"].shape or not values_px.flags.c_contiguous:
             raise ValueError("values of other observations, or no kernels")
         weight, inverse = self._held["weight"], self._held["point_inverse"]
-        steps, out = np.empty((len(inverse), 3)), np.empty(values_px.shape)
-        arguments = (weight, inverse, len(inverse), np.ascontiguousarray(values_px), steps, out, 1)
-        function(ctypes.byref(self._model), *arguments)
-        return steps, out
+        steps = np.empty((len(inverse), 3))
+        function(ctypes.byref(self._model), weight, inverse, len(inverse), values_px, steps, values_px, 1)
+        return steps
 
     def subtract_step(self, moved: FloatArray, left_px: FloatArray) -> None:
         """Subtract design times ``moved`` (I, C), T step of each image, from ``left_px`` (n, 2), in place."""

@@ -23,7 +23,7 @@ def asked():
     system = system_of(model_of(dataclasses.replace(SPEC, num_images=9), seed=5))
     observations, base = system.observations, system.base
     sums = joint_sums(observations, base.left_px, observations.weight, base.point_inverse)
-    pull = sums.off_points(observations.residuals_px())[0]
+    pull = sums.off_points(observations.residuals_px())
     other = OtherSystem(1.0 / observations.sigma_px**2, 0.5 * base.point_inverse, (pull, 2.0 * pull))
     return system, sums, observations.transform, other
 
