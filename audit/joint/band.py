@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from sfm_audit.audit.joint.matrix import PairMatrix, Symmetric, csr_of, groups_of
 from sfm_audit.audit.kernels.joint_matrix import BandPlaces, band_of_blocks
-from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
+from sfm_audit.loaders.arrays import FloatArray, IntArray
 
 _MIN_BLOCKS: Final = 4  # fewer are no band
 _FAR_REACHING: Final = (8, 4, 2)  # times as many couplings as a column commonly has: it belongs to the border
@@ -155,24 +155,6 @@ class BandBlocks(NamedTuple):
         widths = np.diff(band.starts).tolist()
         below = in_blocks(flat_below, list(zip(widths[1:], widths[:-1], strict=True)))
         return cls(flat, flat_below, in_blocks(flat, [(w, w) for w in widths]), below, border)
-
-    def at(self, band: Band, place: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Return entries (B, k, k) of a symmetric matrix at places (B, k), zero in the border.
-
-        The second answer says (B,) where some lie neither in a block nor in the one below it.
-        """
-        lower = np.minimum(place[:, :, None], place[:, None, :])
-        higher = np.maximum(place[:, :, None], place[:, None, :])
-        in_band = higher < band.num_banded
-        number, behind = (np.where(in_band, band.number(each), 0) for each in (lower, higher))
-        width = np.diff(band.starts)[number]
-        column, row = lower - band.starts[number], higher - band.starts[behind]
-        out = np.zeros(lower.shape)
-        for apart, flat, blocks in ((0, self.flat, self.diagonal), (1, self.flat_below, self.below)):
-            starts = np.cumsum([0, *(block.size for block in blocks)])
-            here = in_band & (behind == number + apart)
-            out[here] = flat.take(starts[number[here]] + row[here] * width[here] + column[here])
-        return out, np.asarray((in_band & (behind > number + 1)).any(axis=(1, 2)))
 
 
 def in_blocks(flat: FloatArray, shapes: list[tuple[int, int]]) -> list[FloatArray]:

@@ -87,6 +87,13 @@ class BandedInverse:
             out[k] = self.block(columns[k])
         return np.asarray(out)
 
+    def between(self, block: int, other: int) -> FloatArray:
+        """Entries of Y at the rows of a block of the band and at the columns of the same or of a neighbouring one."""
+        if other < block:
+            return self.between(other, block).T
+        starts = self.factor.band.starts
+        return self.near[block][:, starts[other] - starts[block] : starts[other + 1] - starts[block]]
+
     def arrays(self) -> BandArrays:
         """As compiled sums take it."""
         band, starts = self.factor.band, _places_in_flat(self.near)

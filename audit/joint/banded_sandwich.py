@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from sfm_audit.audit.joint.banded import BandedFactor, across, both_ways
 from sfm_audit.audit.joint.banded_inverse import BandedInverse
 from sfm_audit.audit.joint.lapack import add_both, add_product, mirror, multiply
 from sfm_audit.audit.joint.matrix import Symmetric
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
 
 
 def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[IntArray]) -> list[FloatArray | None]:
@@ -22,8 +23,9 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
     S^+ M S^+ = P X M X P: scores are off the points, track by track, so that M has the null directions of S, M G = 0.
     As block after block is eliminated (U_i, P_i and n, the next block, as in `BandedFactor`), M follows:
     N_i = M_(n, i) - U_i M_(i, i),  M_(n, n) -= H_i + H_i^T,  H_i = U_i (M_(n, i) - U_i M_(i, i) / 2)^T.
-    Then back, Y = X M X, with B_i = X_(n, n) N_i P_i and V_i = Y_(n, n) U_i:
-    Y_(n, i) = B_i - V_i,  Y_(i, i) = P_i M_(i, i) P_i - H_i - H_i^T,  H_i = U_i^T (B_i - V_i / 2).
+    Then back, Y = X M X, with K_i the lower triangle of M_(i, i) and half its diagonal, L_n that of Y_(n, n):
+    Y_(i, i) = H_i + H_i^T,  H_i = (X_(i, n) N_i + P_i K_i) P_i + U_i^T L_n U_i;  where asked for,
+    Y_(n, i) = X_(n, n) N_i P_i - Y_(n, n) U_i.
     All this is of the band; with X + V K V^T in the place of X and Q = (X + V K V^T) M V, the border adds
     B V^T + V B^T, B = Q K - V K V^T M V K / 2.
     """
@@ -33,7 +35,7 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
         """The meat in scaled units times (D, c), by place."""
         return ((meat @ (values[band.place] * scale[:, None])) * scale[:, None])[band.order]
 
-    near = _near(main, band_blocks(meat, band, scale))
+    near = _Near.of(main, band_blocks(meat, band, scale))
     pulled = factor.solve_in_order(times(factor.solve_in_order(null)))
     pull = pulled - 0.5 * null @ (null.T @ pulled)  # P Y P = Y - G H^T - H G^T
     aside, pull = main.aside, np.hstack([pull, -_of_border(factor, times)])
@@ -42,7 +44,7 @@ def banded_sandwiches(main: BandedInverse, meat: Symmetric, blocks: Sequence[Int
         numbers = [k for k, block in enumerate(blocks) if block.size == size]
         columns = np.stack([blocks[k] for k in numbers])
         place = band.place[columns]
-        values, too_far = near.at(band, place)
+        values, too_far = near.at(place)
         outer = aside[place] @ pull[place].swapaxes(1, 2)
         values -= outer + outer.swapaxes(1, 2)
         values *= scale[columns][:, None, :] * scale[columns][:, :, None]
@@ -61,54 +63,99 @@ def _of_border(factor: BandedFactor, times: Callable[[FloatArray], FloatArray]) 
     return np.asarray(factor.solve_in_order(weighed) @ corner - 0.5 * beside @ inner)
 
 
-def _near(main: BandedInverse, meat: BandBlocks) -> BandBlocks:
-    """Y_(i, i) and Y_(i+1, i) of each block i, in the memory of the meat; its border stays."""
-    factor, band, diagonal = main.factor, main.factor.band, meat.diagonal
-    middle = band.middle
+@dataclass(frozen=True, slots=True, eq=False)
+class _Near:
+    """Y_(i, i) of each block i, and N_i between blocks, in the memory of the meat."""
 
-    def inwards(order: list[tuple[int, int]]) -> FloatArray:
-        """What the middle loses by the blocks on one side of it."""
-        lost = np.zeros_like(diagonal[middle])
+    main: BandedInverse
+    diagonal: list[FloatArray]
+    below: list[FloatArray]
+
+    @classmethod
+    def of(cls, main: BandedInverse, meat: BandBlocks) -> _Near:
+        """Go to the middle and back."""
+        band, middle = main.factor.band, meat.diagonal[main.factor.band.middle]
+        out = cls(main, meat.diagonal, meat.below)
+        for lost in both_ways(band, out._inwards):
+            middle -= lost
+        mirror(middle.T)
+        half = out._half(band.middle)
+        add_both(middle.T, half, main.factor.pivots[band.middle], keep=0.0)
+        mirror(middle.T)
+        both_ways(band, out._outwards)
+        return out
+
+    def _inwards(self, order: list[tuple[int, int]]) -> FloatArray:
+        """Eliminate blocks on one side of the middle; return what it loses by them."""
+        factor, middle = self.main.factor, self.main.factor.band.middle
+        lost = np.zeros_like(self.diagonal[middle])
         for block, following in order:
-            step, beside = factor.step(block), across(meat.below, middle, block)
+            step, beside = factor.step(block), across(self.below, middle, block)
             half = beside.copy(order="K")
-            mirror(diagonal[block].T)
-            add_product(half, step, diagonal[block], -0.5)
-            to, sign = (lost, 1.0) if following == middle else (diagonal[following], -1.0)
+            mirror(self.diagonal[block].T)
+            add_product(half, step, self.diagonal[block], -0.5)
+            to, sign = (lost, 1.0) if following == middle else (self.diagonal[following], -1.0)
             add_both(to.T, step, half, sign)
             np.subtract(half, beside, out=beside)
             beside += half
         return lost
 
-    def outwards(order: list[tuple[int, int]]) -> None:
+    def _outwards(self, order: list[tuple[int, int]]) -> None:
+        """Y_(i, i) of the blocks on one side of the middle."""
+        factor, middle = self.main.factor, self.main.factor.band.middle
         for block, following in reversed(order):
-            step, beside, own = factor.step(block), across(meat.below, middle, block), diagonal[block]
-            _between(own, factor.pivots[block])
-            moved, after = np.empty_like(step), np.empty_like(step)
-            add_product(after, beside, factor.pivots[block], keep=0.0)
-            add_product(moved, main.near[following][:, : len(step)], after, keep=0.0)
-            add_product(after, diagonal[following], step, 0.5, keep=0.0)
-            moved -= after
-            np.subtract(moved, after, out=beside)
-            add_both(own.T, step.T, moved.T, -1.0)
-            mirror(own.T)
+            step, own, before = factor.step(block), self.diagonal[block].T, self.diagonal[following].T
+            half = self._half(block)
+            add_product(half, self.main.between(block, following), across(self.below, middle, block))
+            add_both(own, half, factor.pivots[block], keep=0.0)
+            moved = step.T.copy(order="K")
+            multiply(moved, before)
+            moved -= 0.5 * before.diagonal() * step.T
+            add_both(own, moved, step.T)
+            mirror(own)
 
-    for lost in both_ways(band, inwards):
-        diagonal[middle] -= lost
-    mirror(diagonal[middle].T)
-    _between(diagonal[middle], factor.pivots[middle])
-    mirror(diagonal[middle].T)
-    both_ways(band, outwards)
-    return meat
+    def _half(self, block: int) -> FloatArray:
+        """P_i K_i; half of the diagonal of M_(i, i) goes."""
+        lower = self.diagonal[block].T
+        np.einsum("ii->i", lower)[...] *= 0.5
+        half = self.main.factor.pivots[block].copy()
+        multiply(half, lower)
+        return half
 
+    def at(self, place: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Return entries (B, k, k) at places (B, k), zero in the border.
 
-def _between(own: FloatArray, pivot: FloatArray) -> None:
-    """Turn M into the lower triangle, in Fortran order, of P M P; of M that triangle is taken.
+        The second answer says (B,) where some lie neither in a block nor between one and the next.
+        """
+        band = self.main.factor.band
+        lower = np.minimum(place[:, :, None], place[:, None, :])
+        higher = np.maximum(place[:, :, None], place[:, None, :])
+        in_band = higher < band.num_banded
+        number, behind = (np.where(in_band, band.number(each), 0) for each in (lower, higher))
+        out = np.zeros(lower.shape)
+        for apart, of_blocks in ((0, self._within), (1, self._between)):
+            asked = np.nonzero(in_band & (behind == number + apart))
+            by_block = np.argsort(number[asked], kind="stable")
+            asked = tuple(each[by_block] for each in asked)
+            numbers = number[asked]
+            for block in distinct(numbers).tolist():
+                start, stop = np.searchsorted(numbers, (block, block + 1)).tolist()
+                some = tuple(each[start:stop] for each in asked)
+                first, last = band.starts[block], band.starts[block + apart]
+                out[some] = of_blocks(block, lower[some] - first, higher[some] - last)
+        return out, np.asarray((in_band & (behind > number + 1)).any(axis=(1, 2)))
 
-    With K the triangle and half the diagonal: (P K) P + P (P K)^T.
-    """
-    lower = own.T
-    np.einsum("ii->i", lower)[...] *= 0.5
-    half = pivot.copy()
-    multiply(half, lower)
-    add_both(lower, half, pivot, keep=0.0)
+    def _within(self, block: int, first: IntArray, last: IntArray) -> FloatArray:
+        """Entries of Y_(i, i)."""
+        return self.diagonal[block][first, last]
+
+    def _between(self, block: int, first: IntArray, last: IntArray) -> FloatArray:
+        """Entries of Y at rows of a block and columns of the next one, some (k,) of each."""
+        factor, middle = self.main.factor, self.main.factor.band.middle
+        outer, inner, row, column = (
+            (block, block + 1, last, first) if block < middle else (block + 1, block, first, last)
+        )
+        rows, at = np.unique(row, return_inverse=True)
+        pulled = self.main.between(inner, inner)[rows] @ across(self.below, middle, outer)
+        found = pulled @ factor.pivots[outer] - self.diagonal[inner][rows] @ factor.step(outer)
+        return np.asarray(found[at, column])

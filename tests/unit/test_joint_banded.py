@@ -220,11 +220,13 @@ def test_a_further_null_direction_is_found_in_a_band_too(street, reduced):
 
 
 def test_covariances_are_the_sandwich_by_numpy(street, reduced, scale):
-    """S^+ M S^+ at the columns of every image and of every camera, in units of unit diagonal."""
+    """S^+ M S^+ at the columns of every image, of every camera and on both sides of every border between two blocks."""
     meat = score_meat(street.observations, street.base.left_px).toarray() / scale / scale[:, None]
     unit = np.linalg.pinv(reduced.matrix.toarray() / scale / scale[:, None], rcond=1e-11, hermitian=True)
     expected, layout = unit @ meat @ unit, street.observations.layout
-    blocks = [*layout.columns, *(layout.own_of_camera(k) for k in range(len(street.model.cameras)))]
+    band = street.base.inverse.main.factor.band
+    on_both_sides = [band.order[start - 4 : start + 5] for start in band.starts[1:-1].tolist()]
+    blocks = [*layout.columns, *(layout.own_of_camera(k) for k in range(len(street.model.cameras))), *on_both_sides]
     found = banded_sandwiches(street.base.inverse.main, score_meat(street.observations, street.base.left_px), blocks)
     for block, own, public in zip(blocks, found, street.covariances(blocks), strict=True):
         both = scale[block] * scale[block][:, None]
