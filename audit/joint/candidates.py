@@ -20,7 +20,8 @@ class CandidateScores:
     """c candidate fields, projected off the base: sums that need nobody beyond who shares their tracks.
 
     sq_length: (c,) |E|^2 before the projection.    gram: (c, c) K.    score: (c,) u.
-    meat: (c, c) sum of G_t^T G_t over the T tracks that the images see.    num_tracks: T.
+    meat: (c, c) sum of G_t^T G_t over the T tracks that the images see.    num_tracks: T.    Compiled sums leave K and
+    this zero between a field along one axis and one with both components: no group has both.
     support: (s,) columns of the base that the fields meet.    basis_coupling, basis_solution: (s, f) R and B = S^+ R of
     the basis that the fields are made of.    fields: (f, c) how; None where they are the basis.
     num_observations: of the images.

@@ -29,7 +29,7 @@ from sfm_audit.audit.joint.observations import joint_observations
 from sfm_audit.audit.joint.own import own_parameters
 from sfm_audit.audit.joint.system import joint_system
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
-from sfm_audit.audit.kernels.joint import JointArrays, JointIndex, JointSums
+from sfm_audit.audit.kernels.joint import SCALAR, JointArrays, JointIndex, JointSums
 from sfm_audit.audit.kernels.joint_normal import OtherSystem, meats, normals
 from sfm_audit.audit.kernels.joint_parts import (
     components,
@@ -97,13 +97,22 @@ def close(found, expected, scale=None, tolerance=TOLERANCE):
     assert_allclose(found / scale, expected / scale, atol=tolerance, rtol=0)
 
 
+def of_one_kind(found):
+    """(c, c) fields along the axes with each other, those with both components with each other: no group has both."""
+    both = np.zeros(len(found.gram), bool) if found.fields is None else (found.fields[2 * SCALAR :] != 0).any(axis=0)
+    along = np.ones(len(found.gram), bool) if found.fields is None else (found.fields[: 2 * SCALAR] != 0).any(axis=0)
+    assert not (both & along).any()
+    assert all(len(set(both[own].tolist())) <= 1 for own in GROUP_COLUMNS.values())
+    return both == both[:, None]
+
+
 def same_scores(found, expected, tolerance=TOLERANCE):
     unit = np.sqrt(np.maximum(expected.sq_length, 1e-300))
     assert_allclose(found.sq_length, expected.sq_length, rtol=TOLERANCE, atol=1e-300)
-    both_units = unit * unit[:, None]
-    close(found.gram / both_units, expected.gram / both_units, 1.0, tolerance)
+    both_units, asked = unit * unit[:, None], of_one_kind(found)
+    close(found.gram / both_units, asked * expected.gram / both_units, 1.0, tolerance)
     close(found.score / unit, expected.score / unit, tolerance=tolerance)
-    close(found.meat / both_units, expected.meat / both_units, tolerance=tolerance)
+    close(found.meat / both_units, asked * expected.meat / both_units, tolerance=tolerance)
     np.testing.assert_array_equal(found.support, expected.support)
     close(found.coupling / unit, expected.coupling / unit)
     close(found.solution / unit, expected.solution / unit, tolerance=tolerance)

@@ -84,10 +84,11 @@ enum {
 /* Where x^a y^b stands among the moments: by degree, then by the power of y, as among the scalars. */
 static inline int moment_of(int a, int b) { return (a + b) * (a + b + 1) / 2 + b; }
 
-/* Sums of products of own fields with weights P (2, 2): half of E^T P E. Scalars times scalars are moments of the point. */
+/* Sums of products of own fields with weights P (2, 2): half of E^T P E. Scalars times scalars are moments of the point; scalars
+ * times dense fields are not summed: nothing that is tested mixes them. */
 typedef struct {
     double moments[4][MOMENTS]; /* by P_xx, P_xy, P_yy, w */
-    double mixed[2][SCALAR][DENSE], dd[DENSE][DENSE], dense_plain[DENSE]; /* w E^T E of the dense fields: its diagonal */
+    double dd[DENSE][DENSE], dense_plain[DENSE]; /* w E^T E of the dense fields: its diagonal */
 } own_gram;
 
 /* What add_gram needs of each of some observations. */
@@ -112,16 +113,13 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
         }
     }
     add_products(4, MOMENTS / LANES, num, parts->p[0], 4, 1, parts->moment[0], MOMENTS, g->moments[0], MOMENTS);
-    for (int axis = 0; axis < 2; axis++) {
-        add_products(SCALAR, DENSE / LANES, num, scalar, SCALAR, 1, parts->by_p[0][axis], 2 * DENSE, g->mixed[axis][0], DENSE);
-    }
     for (int i = 0; i < DENSE; i += LANES) { /* at and right of the diagonal; both axes one behind the other */
         add_products(LANES, (DENSE - i) / LANES, 2 * num, dense + i, DENSE, 1, parts->by_p[0][0] + i, DENSE, g->dd[i] + i, DENSE);
     }
 }
 
-/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, at and right of the diagonal, and w E^T E of the scalars, of the dense fields
- * its diagonal. */
+/* From the sums to (FIELDS, FIELDS) E^T (w - ..) E, at and right of the diagonal, zero between scalars and dense fields, and w E^T E
+ * of the scalars, of the dense fields its diagonal. */
 static void spread_gram(const own_gram *g, double *gram, double *plain, double *dense_plain) {
     int power_x[SCALAR], power_y[SCALAR];
     for (int degree = 0, k = 0; degree <= 4; degree++) {
@@ -136,12 +134,6 @@ static void spread_gram(const own_gram *g, double *gram, double *plain, double *
             gram[i * FIELDS + SCALAR + j] = gram[(SCALAR + j) * FIELDS + i] = g->moments[1][k];
             gram[(SCALAR + i) * FIELDS + SCALAR + j] = g->moments[2][k];
             plain[i * SCALAR + j] = g->moments[3][k];
-        }
-    }
-    for (int i = 0; i < SCALAR; i++) {
-        for (int j = 0; j < DENSE; j++) {
-            gram[i * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + i] = g->mixed[0][i][j];
-            gram[(SCALAR + i) * FIELDS + 2 * SCALAR + j] = gram[(2 * SCALAR + j) * FIELDS + SCALAR + i] = g->mixed[1][i][j];
         }
     }
     for (int i = 0; i < DENSE; i++) {
@@ -167,7 +159,7 @@ static void subtract_pair(double *gram, const double *fi, const double *di, cons
     }
     for (int a = 0; a < FIELDS; a++) {
         double x = left[a][0] * p[0] + left[a][1] * p[2], y = left[a][0] * p[1] + left[a][1] * p[3];
-        for (int b = 0; b < FIELDS; b++) {
+        for (int b = a < 2 * SCALAR ? 0 : 2 * SCALAR; b < (a < 2 * SCALAR ? 2 * SCALAR : FIELDS); b++) {
             double value = x * right[b][0] + y * right[b][1];
             gram[a * FIELDS + b] -= value, gram[b * FIELDS + a] -= value;
         }

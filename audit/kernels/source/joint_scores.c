@@ -130,13 +130,15 @@ static inline __attribute__((always_inline)) void add_included(
     }
 }
 
-/* out (FIELDS, FIELDS) += left^T right, both (num, FIELDS), at and right of the diagonal, four rows at a time. */
+/* out (FIELDS, FIELDS) += left^T right, both (num, FIELDS), at and right of the diagonal, four rows at a time: of scalars with scalars,
+ * and of dense fields with dense fields. */
 INLINE void add_symmetric(int64_t num, const double *left, const double *right, double *out) {
     for (int64_t first = 0; first < num; first += TRACKS_AT_ONCE) {
         int64_t count = num - first < TRACKS_AT_ONCE ? num - first : TRACKS_AT_ONCE;
         for (int64_t a = 0; a < FIELDS; a += LANES) {
             const double *l = left + FIELDS * first + a, *r = right + FIELDS * first + a;
-            add_products(LANES, (FIELDS - a) / LANES, count, l, FIELDS, 1, r, FIELDS, out + FIELDS * a + a, FIELDS);
+            int64_t end = a < 2 * SCALAR ? 2 * SCALAR : FIELDS;
+            add_products(LANES, (end - a) / LANES, count, l, FIELDS, 1, r, FIELDS, out + FIELDS * a + a, FIELDS);
         }
     }
 }
@@ -278,8 +280,8 @@ void joint_look_up(const joint_model *m, const seen_points *p, int64_t first, in
  *
  * images (num); facts (num, 27), is_fisheye, power (num): as joint_fields has them.    most_rows, most_views, most_columns:
  * of these images, of the views of their points, and of design and included fields around.    widest: most columns of one image.
- * Out, by image: status; num_tracks; gram, meat (44, 44); plain (16, 16), dense_plain (12): w E^T E, its diagonal; score (44); right,
- * solution (width, 44): R and B at its own columns, zero where it has none. */
+ * Out, by image: status; num_tracks; gram, meat (44, 44), zero between scalars and dense fields; plain (16, 16), dense_plain (12):
+ * w E^T E, its diagonal; score (44); right, solution (width, 44): R and B at its own columns, zero where it has none. */
 KERNEL int64_t joint_scores(
     const joint_model *m, const base_inverse *s, const seen_points *p, int64_t num, const int64_t *images, const double *facts,
     const int64_t *is_fisheye, const int64_t *power, int64_t most_rows, int64_t most_views, int64_t most_columns, int64_t widest, int64_t *status, int64_t *num_tracks,
