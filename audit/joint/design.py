@@ -12,6 +12,7 @@ from sfm_audit.audit.inliers.projected import image_inliers
 from sfm_audit.audit.inliers.residuals import ModelResiduals
 from sfm_audit.audit.joint.layout import NUM_POSE, Layout
 from sfm_audit.audit.kernels import kernels_in_use
+from sfm_audit.audit.kernels.checked import aligned_zeros
 from sfm_audit.audit.kernels.joint_parts import DesignInputs, fill_design
 from sfm_audit.audit.kernels.threads import over_ranges
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
@@ -90,7 +91,7 @@ def make_design(
     is_kept = counts <= AT_ONCE
     ends = np.cumsum(np.where(is_kept, counts, 0))
     first = np.where(is_kept, ends - counts, -1).astype(np.int64)
-    kept = np.zeros((int(ends[-1]) if ends.size else 0, 2, layout.width))
+    kept = aligned_zeros((int(ends[-1]) if ends.size else 0, 2, layout.width))
     images = np.flatnonzero(is_kept & (counts > 0))
     of_kept = source if is_kept.all() else source[np.repeat(is_kept, counts)]
 
@@ -165,9 +166,11 @@ def _inputs(
         residuals.residuals_px,
         source,
         residuals.offsets[images],
-        model.points.xyz_world.take(residuals.point_idx[source], axis=0),
-        model.observations.xy_px.take(residuals.observation_row[source], axis=0),
-        [residuals.d_extra[image] for image in images.tolist()],
+        residuals.point_idx,
+        residuals.observation_row,
+        model.points.xyz_world,
+        model.observations.xy_px,
+        residuals.d_extra.of(images.tolist()),
     )
     return inputs, holds
 

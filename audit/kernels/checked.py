@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import math
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
 SmallIntArray: TypeAlias = NDArray[np.int32]
+_LINE: Final = 8  # doubles
 
 
 def ints(values: IntArray, size: int) -> IntArray:
@@ -38,6 +40,14 @@ def doubles(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     if out.shape != shape:
         raise ValueError(f"expected an array of shape {shape}, found {out.shape}")
     return out
+
+
+def aligned_zeros(shape: tuple[int, ...]) -> FloatArray:
+    """Return zeros that begin where a line of the cache does: 16 doubles then lie in two lines, not in three."""
+    size = math.prod(shape)
+    room = np.zeros(size + _LINE)
+    start = -(room.ctypes.data // room.itemsize) % _LINE
+    return room[start : start + size].reshape(shape)
 
 
 def first_views(held: dict[str, Any]) -> BoolArray:

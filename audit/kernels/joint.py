@@ -196,13 +196,13 @@ class JointSums:
         return bool(self.index.num_views[image_idx] <= _MOST_VIEWS)
 
     def off_points(self, values_px: FloatArray) -> FloatArray:
-        """Return (P, 3) V^-1 J^T w values; from the values (n, 2) what that removes is subtracted in place."""
-        function = kernel("joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles, Doubles, Size)
+        """Return (P, 3) V^-1 J^T w values, and take what that removes off the values (n, 2), in place."""
+        function = kernel("joint_off_points", _ModelPointer, Doubles, Doubles, Size, Doubles, Doubles)
         if function is None or values_px.shape != self._held["left"].shape or not values_px.flags.c_contiguous:
             raise ValueError("values of other observations, or no kernels")
         weight, inverse = self._held["weight"], self._held["point_inverse"]
         steps = np.empty((len(inverse), 3))
-        function(ctypes.byref(self._model), weight, inverse, len(inverse), values_px, steps, values_px, 1)
+        function(ctypes.byref(self._model), weight, inverse, len(inverse), values_px, steps)
         return steps
 
     def subtract_step(self, moved: FloatArray, left_px: FloatArray) -> None:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sfm_audit.audit.kernels.checked import doubles, ints, small_ints
-from sfm_audit.audit.kernels.joint import JointIndex
+from sfm_audit.audit.kernels.joint import DONE, JointIndex
 from sfm_audit.audit.kernels.library import Doubles, Ints, Size, SmallInts, kernel
 from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 
@@ -25,7 +25,8 @@ class DesignInputs(NamedTuple):
     parameter e; -1 none.
     jacobian: (2, 3, N) in the points, residuals_px: (2, N), of all inliers of the model.
     source: (n,) columns of both.    first: (k,) columns of the images' first inliers.
-    xyz_world: (n, 3).    observed_px: (n, 2).    d_extra: of each image (e, 2, m), of its m inliers.
+    point_idx, observation_row: (N,) rows of xyz_world (P, 3) and of observed_px (M, 2).
+    d_extra: of each image (e, 2, m), of its m inliers.
     """
 
     offsets: IntArray
@@ -35,6 +36,8 @@ class DesignInputs(NamedTuple):
     residuals_px: FloatArray
     source: IntArray
     first: IntArray
+    point_idx: Int32Array
+    observation_row: Int32Array
     xyz_world: FloatArray
     observed_px: FloatArray
     d_extra: Sequence[FloatArray]
@@ -42,8 +45,9 @@ class DesignInputs(NamedTuple):
 
 def fill_design(out: FloatArray, given: DesignInputs) -> bool:
     """Write the design (n, 2, C) of some images; False for the numpy path."""
+    of_images, of_rows = (Ints, Doubles, Ints), (Doubles, Doubles, *([Ints] * 4))
     function = kernel(
-        "joint_designs", *([Size] * 3), *(Ints, Doubles, Ints, Doubles, Doubles, Ints, *([Ints] * 3)), *([Doubles] * 4)
+        "joint_designs", *([Size] * 3), *of_images, *of_rows, Size, Size, SmallInts, SmallInts, *([Doubles] * 4)
     )
     (n, _, width), (k, num_own), num_all = out.shape, given.own.shape, given.jacobian.shape[2]
     counts = np.array([each.shape[2] for each in given.d_extra], dtype=np.int64)
@@ -62,11 +66,11 @@ def fill_design(out: FloatArray, given: DesignInputs) -> bool:
     sizes = [each.size for each in given.d_extra]
     starts = np.cumsum([0, *sizes])[:-1].astype(np.int64)
     extra = np.concatenate([each.ravel() for each in given.d_extra]) if sum(sizes) else np.zeros(1)
-    of_images = ints(given.offsets, k + 1), given.facts, np.ascontiguousarray(given.own)
-    of_rows = doubles(given.xyz_world, (n, 3)), doubles(given.observed_px, (n, 2))
-    columns = given.source, given.first, counts, starts
-    function(k, width, num_all, *of_images, given.jacobian, given.residuals_px, *columns, *of_rows, extra, out)
-    return True
+    images = ints(given.offsets, k + 1), given.facts, np.ascontiguousarray(given.own)
+    columns = given.jacobian, given.residuals_px, given.source, given.first, counts, starts
+    xyz, observed = (np.ascontiguousarray(each) for each in (given.xyz_world, given.observed_px))
+    looked_up = small_ints(given.point_idx, num_all), small_ints(given.observation_row, num_all), xyz, observed
+    return int(function(k, width, num_all, *images, *columns, len(xyz), len(observed), *looked_up, extra, out)) == DONE
 
 
 def _lie_inside(given: DesignInputs, counts: IntArray) -> bool:

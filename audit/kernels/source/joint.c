@@ -349,10 +349,9 @@ int64_t joint_second(
     return DONE;
 }
 
-/* steps (P, 3): V^-1 J^T w values (n, 2); cleaned (n, 2): values minus J steps, where asked for (not NULL). */
+/* steps (P, 3): V^-1 J^T w values (n, 2); J steps is taken off the values. */
 KERNEL int64_t joint_off_points(
-    const joint_model *m, const double *weight, const double *inverse, int64_t num_points, const double *values,
-    double *steps, double *cleaned, int64_t with_cleaned) {
+    const joint_model *m, const double *weight, const double *inverse, int64_t num_points, double *values, double *steps) {
     for (int64_t p = 0; p < num_points; p++) {
         double pull[3] = {0.0, 0.0, 0.0};
         for (int64_t k = m->point_offsets[p]; k < m->point_offsets[p + 1]; k++) {
@@ -369,11 +368,11 @@ KERNEL int64_t joint_off_points(
         const double *v = inverse + 9 * p;
         double *s = steps + 3 * p;
         for (int i = 0; i < 3; i++) s[i] = v[3 * i] * pull[0] + v[3 * i + 1] * pull[1] + v[3 * i + 2] * pull[2];
-        for (int64_t k = m->point_offsets[p]; with_cleaned && k < m->point_offsets[p + 1]; k++) {
+        for (int64_t k = m->point_offsets[p]; k < m->point_offsets[p + 1]; k++) {
             int64_t row = m->by_point[k];
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
-            cleaned[2 * row] = values[2 * row] - (jx[0] * s[0] + jx[1] * s[1] + jx[2] * s[2]);
-            cleaned[2 * row + 1] = values[2 * row + 1] - (jy[0] * s[0] + jy[1] * s[1] + jy[2] * s[2]);
+            values[2 * row] -= jx[0] * s[0] + jx[1] * s[1] + jx[2] * s[2];
+            values[2 * row + 1] -= jy[0] * s[0] + jy[1] * s[1] + jy[2] * s[2];
         }
     }
     return DONE;

@@ -91,7 +91,7 @@ static inline void collect(const joint_model *m, int64_t first, int64_t last, in
 INLINE void soon(const joint_model *m, const int32_t *view, int64_t j, int64_t end) {
     if (j + AHEAD < end) {
         const double *design = m->design + view[j + AHEAD] * 2 * m->width;
-        for (int64_t c = 0; c < 2 * m->width + 8; c += 8) SOON(design + (c < 2 * m->width ? c : 2 * m->width - 1));
+        for (int64_t c = 0; c < 2 * m->width; c += 8) SOON(design + c);
         SOON(m->weight + view[j + AHEAD]), SOON(m->left + 2 * view[j + AHEAD]);
     }
 }

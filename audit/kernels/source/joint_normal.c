@@ -74,7 +74,7 @@ INLINE void ask_ahead(const joint_model *m, int64_t row, int64_t last, int64_t i
     int64_t point = m->point_idx[row + 2];
     for (int64_t k = view_from(m, point, image); k < m->point_offsets[point + 1]; k++) {
         const double *design = m->design + m->by_point[k] * 2 * m->width;
-        for (int64_t c = 0; c < 2 * m->width + 8; c += 8) SOON(design + (c < 2 * m->width ? c : 2 * m->width - 1));
+        for (int64_t c = 0; c < 2 * m->width; c += 8) SOON(design + c);
         SOON(m->weight + m->by_point[k]);
         if (!of) SOON(m->left + 2 * m->by_point[k]);
     }

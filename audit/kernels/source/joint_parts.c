@@ -95,17 +95,29 @@ KERNEL int64_t joint_dense_entries(int64_t num, const int64_t *columns, int64_t 
  * offsets (num + 1): where each image's rows begin.    facts (num, 25): R, its inverse, t, fx, fy, cx, cy.
  * own (num, width - 6): 0 focal length of both axes, 1 of x, 2 of y, 3 + e distortion parameter e, -1 none.
  * jacobian (2, 3, total), residuals (2, total); source (n): their columns.    first, counts, starts (num): of an image's inliers
- * the first column, their number, and where extra (e, 2, count) of them begins.    xyz (n, 3) world, observed (n, 2) px. */
+ * the first column, their number, and where extra (e, 2, count) of them begins.    point_idx, observation_row (total): rows of
+ * xyz (num_points, 3) world and observed (num_observations, 2) px. NEEDS_NUMPY: one of these leads outside. */
 KERNEL int64_t joint_designs(
     int64_t num, int64_t width, int64_t total, const int64_t *offsets, const double *all_facts, const int64_t *all_own,
     const double *jacobian, const double *residuals, const int64_t *source, const int64_t *first, const int64_t *counts,
-    const int64_t *starts, const double *xyz, const double *observed, const double *extra, double *restrict out) {
+    const int64_t *starts, int64_t num_points, int64_t num_observations, const int32_t *point_idx, const int32_t *observation_row,
+    const double *xyz, const double *observed, const double *extra, double *restrict out) {
+    for (int64_t k = 0; k < (num ? offsets[num] : 0); k++) {
+        int64_t point = point_idx[source[k]], row = observation_row[source[k]];
+        if (point < 0 || point >= num_points || row < 0 || row >= num_observations) return NEEDS_NUMPY;
+    }
     for (int64_t image = 0; image < num; image++) {
         const double *r = all_facts + 25 * image, *inverse = r + 9, *t = r + 18, *focal = r + 21, *centre = r + 23;
         const int64_t *own = all_own + image * (width - 6), count = counts[image];
         const double *of_image = extra + starts[image];
         for (int64_t k = offsets[image]; k < offsets[image + 1]; k++) {
-            const double *p = xyz + 3 * k;
+            if (k + AHEAD < offsets[image + 1]) {
+                int64_t later = source[k + AHEAD];
+                SOON(xyz + 3 * point_idx[later]), SOON(observed + 2 * observation_row[later]), SOON(residuals + later);
+                SOON(residuals + total + later);
+                for (int i = 0; i < 6; i++) SOON(jacobian + i * total + later);
+            }
+            const double *p = xyz + 3 * point_idx[source[k]], *seen = observed + 2 * observation_row[source[k]];
             double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
             double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
             for (int axis = 0; axis < 2; axis++) {
@@ -118,7 +130,7 @@ KERNEL int64_t joint_designs(
                     double value = 0.0;
                     if (own[c] >= 3) value = of_image[(2 * (own[c] - 3) + axis) * count + source[k] - first[image]];
                     else if (own[c] == 0 || own[c] == axis + 1) {
-                        value = (observed[2 * k + axis] - residuals[axis * total + source[k]] - centre[axis]) / focal[axis];
+                        value = (seen[axis] - residuals[axis * total + source[k]] - centre[axis]) / focal[axis];
                     }
                     to[6 + c] = value;
                 }
