@@ -14,6 +14,8 @@ from sfm_audit.loaders.arrays import FloatArray, Int32Array, IntArray
 from sfm_audit.loaders.model import SparseModel
 
 _AT_ONCE: Final = 16  # images: who asks for one mostly asks for the next one then
+_HELD: Final = 4  # such blocks, for threads that ask at the same time
+_FEW: Final = 1 << 12  # inliers; an image with more is made alone, and not held
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +30,10 @@ class Projectable:
     scene: Scene
     offsets: IntArray
     point_idx: Int32Array
+
+    def has_few(self, image_idx: int) -> bool:
+        """Whether the image is made with others."""
+        return bool(self.offsets[image_idx + 1] - self.offsets[image_idx] <= _FEW)
 
     def derivatives(self, image_idxs: Sequence[int]) -> list[FloatArray]:
         """Return what `DistortionDerivatives` holds of some images; none of them without a camera."""
@@ -59,7 +65,7 @@ class DistortionDerivatives:
 
     def __init__(self, kept: Mapping[int, FloatArray], made: Projectable | None = None, num_images: int = 0) -> None:
         self._kept, self._made, self._num_images = kept, made, num_images
-        self._last: Mapping[int, FloatArray] = {}
+        self._last: Mapping[int, Mapping[int, FloatArray]] = {}
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -73,14 +79,18 @@ class DistortionDerivatives:
         """Those of an image."""
         if image_idx in self._kept:
             return self._kept[image_idx]
-        last = self._last  # another thread may put its own in its place
-        if image_idx not in last:
-            if self._made is None or not 0 <= image_idx < len(self):
-                raise IndexError(f"there is no image in row {image_idx}")
-            start = image_idx - image_idx % _AT_ONCE
-            images = [each for each in range(start, min(start + _AT_ONCE, len(self))) if each not in self._kept]
-            self._last = last = dict(zip(images, self._made.derivatives(images), strict=True))
-        return last[image_idx]
+        if self._made is None or not 0 <= image_idx < len(self):
+            raise IndexError(f"there is no image in row {image_idx}")
+        if not self._made.has_few(image_idx):
+            return self._made.derivatives([image_idx])[0]
+        start, last = image_idx - image_idx % _AT_ONCE, self._last  # another thread may put its own in its place
+        block = last.get(start)
+        if block is None:
+            near = (each for each in range(start, min(start + _AT_ONCE, len(self))) if each not in self._kept)
+            images = [each for each in near if self._made.has_few(each)]
+            block = dict(zip(images, self._made.derivatives(images), strict=True))
+            self._last = {**dict(list(last.items())[1 - _HELD :]), start: block}
+        return block[image_idx]
 
     def of(self, image_idxs: Sequence[int]) -> tuple[FloatArray, ...]:
         """Return those of some images, beside each other in memory where none of them is kept."""

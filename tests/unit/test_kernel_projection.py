@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import hyp2f1
 
 from sfm_audit.audit.inliers import kept
+from sfm_audit.audit.inliers.distortion import Projectable
 from sfm_audit.audit.inliers.residuals import image_residuals, model_residuals
 from sfm_audit.audit.inliers.stationarity import offset_px, offsets_of_sums
 from sfm_audit.audit.kernels import kernels_in_use, numpy_only
@@ -221,3 +222,27 @@ def test_one_image_of_a_model_is_what_it_is_alone():
         model.image(4), model.observations.xy_px[linked], model.points.xyz_world[point_idx], point_idx
     )
     assert_allclose(found.residuals_px[:, found.rows(4)], part.residuals_px, rtol=1e-11)
+
+
+def test_derivatives_in_the_distortion_are_held_for_those_who_ask_in_turns(monkeypatch):
+    model = model_with("OPENCV", sizes=(3,) * 100)
+    made, calls = model_residuals(model).d_extra, []
+    derivatives = Projectable.derivatives
+    monkeypatch.setattr(Projectable, "derivatives", lambda self, i: calls.append(tuple(i)) or derivatives(self, i))
+    for step in range(16):  # four that go through blocks of their own, at the same time
+        for start in (0, 16, 32, 96):
+            if start + step < 100:
+                assert made[start + step].shape == (4, 2, 3)
+    assert calls == [tuple(range(start, min(start + 16, 100))) for start in (0, 16, 32, 96)]
+    made[64]
+    assert (made[20].shape, len(calls)) == ((4, 2, 3), 5)  # the oldest block went, the others are there
+    made[0]
+    assert (calls[5], len(calls)) == (tuple(range(16)), 6)
+
+
+def test_an_image_with_many_inliers_is_made_alone(monkeypatch):
+    model, calls = model_with("SIMPLE_RADIAL", sizes=(3, 4096, 4097, 3)), []
+    made, derivatives = model_residuals(model).d_extra, Projectable.derivatives
+    monkeypatch.setattr(Projectable, "derivatives", lambda self, i: calls.append(tuple(i)) or derivatives(self, i))
+    assert [made[image].shape for image in (2, 3, 2, 1, 0)] == [(1, 2, n) for n in (4097, 3, 4097, 4096, 3)]
+    assert calls == [(2,), (0, 1, 3), (2,)]
