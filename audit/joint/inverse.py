@@ -9,8 +9,8 @@ import numpy as np
 
 from sfm_audit.audit.joint.band import Band, band_of, dense_of
 from sfm_audit.audit.joint.banded import BandedFactor, banded_factor
-from sfm_audit.audit.joint.banded_inverse import BandedInverse, banded_inverse
-from sfm_audit.audit.joint.lapack import cholesky_in_place, inverse_of_factor, solve_by_factor
+from sfm_audit.audit.joint.banded_inverse import banded_inverse
+from sfm_audit.audit.joint.lapack import cholesky_in_place, inverse_of_factor, mirror, solve_by_factor
 from sfm_audit.audit.joint.matrix import Symmetric
 from sfm_audit.audit.kernels.joint_parts import dense_entries
 from sfm_audit.audit.kernels.joint_scores import BandArrays
@@ -21,6 +21,8 @@ _DEAD: Final = 1e-12  # share of B's diagonal that the elimination of points lea
 _GAUGE_EIGENVALUE: Final = 1e-8  # a claimed direction of the gauge that costs more is none
 _SHIFT: Final = 1e-12
 _MAX_NULL: Final = 512
+_TINY: Final = 250  # columns up to which an inverse costs less than looking for null directions
+_SMALL: Final = 2000  # columns of a dense factor that is kept beside its inverse
 _INVERSE_ITERATIONS: Final = 6
 _ROUNDING: Final = 512 * np.finfo(np.float64).eps  # of sums over some thousand observations; measured: 40 to 250
 _IN_NULL: Final = 1e-6  # squared length of a parameter in null directions from which on it is not identified
@@ -188,22 +190,19 @@ def joint_inverse(matrix: Symmetric, before: FloatArray, gauge: FloatArray) -> J
     if not size:
         empty = np.zeros((0, 0))
         return JointInverse(DenseInverse(empty), nothing, nothing, empty, np.zeros(0, dtype=bool), 0, nothing)
-    factor, banded, inverse_scale, free, further = _deflated(matrix, before, gauge, with_inverse=True)
+    factor, main, inverse_scale, free, further = _deflated(matrix, before, gauge, with_inverse=True)
     lost = (inverse_scale == 0) | ((further**2).sum(axis=1) > _IN_NULL)
-    main: SymmetricInverse
-    if isinstance(factor, _DenseFactor):
-        main = _dense_inverse(factor, np.hstack([free, further]), inverse_scale)
-    else:
-        main = banded_inverse(factor, inverse_scale) if banded is None else banded
+    if main is None:
+        main = _inverse(factor, np.hstack([free, further]), inverse_scale, in_place=True)[0]
     unscaled = free * inverse_scale[:, None]
     return JointInverse(main, nothing, nothing, np.zeros((0, 0)), lost, further.shape[1], unscaled)
 
 
 def joint_solution(matrix: Symmetric, before: FloatArray, gauge: FloatArray, right: FloatArray) -> FloatArray:
-    """Return S^+ right (D,) as `joint_inverse` would have it, without the inverse."""
+    """Return S^+ right (D,) as `joint_inverse` would have it."""
     if not len(right):
         return right
-    factor, _, inverse_scale, _, further = _deflated(matrix, before, gauge, with_inverse=False)
+    factor, _, inverse_scale, _, further = _deflated(matrix, before, gauge, with_inverse=len(right) <= _TINY)
     step = factor.solve((right * inverse_scale)[:, None])[:, 0]
     step -= further @ (further.T @ step)  # the last ones that were found are not in the factor where there are too many
     return np.asarray(step * inverse_scale)
@@ -212,12 +211,12 @@ def joint_solution(matrix: Symmetric, before: FloatArray, gauge: FloatArray, rig
 class _Deflated(NamedTuple):
     """The factor in units of unit diagonal.
 
-    banded: S^+, where it was asked for and there is a band.    inverse_scale: (D,) 1 / unit, 0 of dead columns.
+    inverse: S^+, where it was asked for and made on the way.    inverse_scale: (D,) 1 / unit, 0 of dead columns.
     free, further: (D, g) directions of the gauge, (D, k) others found.
     """
 
     factor: BandedFactor | _DenseFactor
-    banded: BandedInverse | None
+    inverse: SymmetricInverse | None
     inverse_scale: FloatArray
     free: FloatArray
     further: FloatArray
@@ -233,19 +232,22 @@ def _deflated(matrix: Symmetric, before: FloatArray, gauge: FloatArray, *, with_
     inverse_scale = np.where(dead, 0.0, 1.0 / scale)
     band = band_of(matrix)
     deflated, further = free, free[:, :0]
+    inverse: SymmetricInverse | None = None
     while True:
         factor = _factor(matrix, inverse_scale, deflated, band)
-        banded = banded_inverse(factor, inverse_scale) if with_inverse and isinstance(factor, BandedFactor) else None
-        if banded is not None and _cannot_be_null(banded.trace, rounding):
-            break
+        if with_inverse and factor.shift == 0.0 and (isinstance(factor, BandedFactor) or len(before) <= _SMALL):
+            inverse, trace = _inverse(factor, deflated, inverse_scale)
+            if _cannot_be_null(trace, rounding):
+                break
         found = _null_directions(factor, rounding)
         if not found.shape[1]:
             break
+        inverse = None
         further = np.hstack([further, found])
         deflated = np.hstack([deflated, found])
         if further.shape[1] >= _MAX_NULL:
             break
-    return _Deflated(factor, banded, inverse_scale, free, further)
+    return _Deflated(factor, inverse, inverse_scale, free, further)
 
 
 def _cannot_be_null(trace: float, rounding: FloatArray) -> bool:
@@ -341,17 +343,23 @@ def _null_directions(factor: BandedFactor | _DenseFactor, rounding: FloatArray) 
         count = min(size, 4 * count)
 
 
-def _dense_inverse(factor: _DenseFactor, deflated: FloatArray, inverse_scale: FloatArray) -> DenseInverse:
-    """From the factor of the scaled, deflated matrix to S^+, in the factor's memory."""
-    inverse = inverse_of_factor(factor.array, in_place=True)
-    size = len(inverse)
-    for start in range(0, size, 512):
-        stop = min(start + 512, size)
-        square = inverse[start:stop, start:stop]
-        square[...] = np.tril(square) + np.tril(square, -1).T
-        inverse[start:stop, stop:] = inverse[stop:, start:stop].T
+def _inverse(
+    factor: BandedFactor | _DenseFactor, deflated: FloatArray, inverse_scale: FloatArray, *, in_place: bool = False
+) -> tuple[SymmetricInverse, float]:
+    """From the factor of the scaled, deflated matrix to S^+, and its trace in units of unit diagonal.
+
+    Parameters
+    ----------
+    deflated : (D, g) that is in the factor, or more        in_place : whether a dense factor's memory may be used
+    """
+    if isinstance(factor, BandedFactor):
+        banded = banded_inverse(factor, inverse_scale)
+        return banded, banded.trace
+    inverse = inverse_of_factor(factor.array, in_place=in_place)
+    mirror(inverse)
     if deflated.shape[1]:
         _add_outer(inverse, deflated, -1.0)
+    trace = float(np.trace(inverse))
     inverse *= inverse_scale[:, None]
     inverse *= inverse_scale
-    return DenseInverse(inverse.T)
+    return DenseInverse(inverse.T), trace

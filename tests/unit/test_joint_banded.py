@@ -158,19 +158,36 @@ def test_both_sides_of_the_middle_in_two_threads_say_the_same(street, monkeypatc
         assert_allclose(one, other, atol=1e-8 * np.abs(other).max())
 
 
-def test_the_trace_rules_null_directions_out_where_there_are_none(street, reduced, scale, monkeypatch):
+@pytest.mark.parametrize("in_a_band", [True, False])
+def test_the_trace_rules_null_directions_out_where_there_are_none(street, reduced, scale, monkeypatch, in_a_band):
     """No direction is looked for then; where it says nothing the search finds as many."""
     unit = reduced.matrix.toarray() / scale / scale[:, None]
-    expected = np.linalg.pinv(unit, rcond=1e-11, hermitian=True)
-    assert_allclose(street.base.inverse.main.trace, np.trace(expected), rtol=1e-8)
+    expected = np.trace(np.linalg.pinv(unit, rcond=1e-11, hermitian=True))
+    if in_a_band:
+        assert_allclose(street.base.inverse.main.trace, expected, rtol=1e-8)
+    else:
+        monkeypatch.setattr(joint_inverses, "band_of", lambda _: None)
     searches: list[int] = []
-    original = joint_inverses._null_directions
-    monkeypatch.setattr(joint_inverses, "_null_directions", lambda *given: (searches.append(1), original(*given))[1])
+    traces: list[float] = []
+    search, rule_out = joint_inverses._null_directions, joint_inverses._cannot_be_null
+    monkeypatch.setattr(joint_inverses, "_null_directions", lambda *given: (searches.append(1), search(*given))[1])
+    monkeypatch.setattr(
+        joint_inverses, "_cannot_be_null", lambda *given: (traces.append(given[0]), rule_out(*given))[1]
+    )
     assert inverted(street).num_null == 0
     assert not searches
+    assert_allclose(traces, [expected], rtol=1e-8)
     monkeypatch.setattr(joint_inverses, "_cannot_be_null", lambda *_: False)
     assert inverted(street).num_null == 0
-    assert searches
+    assert searches == [1]
+    gauge = gauge_directions(street.model, street.observations)
+    given = reduced.matrix, reduced.before, gauge, reduced.right
+    step = joint_solution(*given)
+    assert searches == [1, 1]  # too many columns for an inverse that nobody needs
+    monkeypatch.setattr(joint_inverses, "_TINY", len(reduced.right))
+    monkeypatch.setattr(joint_inverses, "_cannot_be_null", rule_out)
+    assert_array_equal(joint_solution(*given), step)
+    assert searches == [1, 1]
 
 
 @pytest.mark.parametrize(
