@@ -25,6 +25,8 @@ def tests_of_scores(system: JointSystem, scores: Mapping[int, CandidateScores], 
     ----------
     scores : by image, of all candidate fields
     """
+    if not scores:
+        return {}
     images, known = list(scores), list(scores.values())
     sigma_px, rms_px = system.observations.sigma_px[images], system.observations.rms_px[images]
     by_group = {group: test_groups(known, own, sigma_px, rms_px) for group, own in GROUP_COLUMNS.items()}
