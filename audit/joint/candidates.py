@@ -99,38 +99,22 @@ def candidate_scores(
     Where an image has more than 32,768 observations everything is gone through in parts, and what the tracks add up to
     comes in a second round. Sums are in the order of points, whatever the machine.
     """
-    met = _Met(base, images, fields_of, keep_scores=True)
-    right, coupling, gram = met.right, met.coupling, met.gram
-    solution = base.inverse.within(coupling.support, right[:-1])
-    gram -= right[:-1].T @ solution
-    padded = np.vstack([solution, np.zeros((1, len(gram)))])
-    meat = np.zeros_like(gram)
+    met = FieldsMet(base, images, fields_of, keep_scores=True)
+    solution = base.inverse.within(met.support, met.right)
+    padded = np.vstack([solution, np.zeros((1, len(met.gram)))])
+    meat = np.zeros_like(met.gram)
     for part in met.parts:
         own_score = met.sums.track_scores(part) if met.in_parts else met.sums.track_score
-        coupling.subtract_scores(own_score, met.around.of(part), padded, met.kept_scores)
+        met.coupling.subtract_scores(own_score, met.around.of(part), padded, met.kept_scores)
         with np.errstate(over="ignore", invalid="ignore"):  # the test refuses what is not finite
             meat += own_score.T @ own_score
-    num_observations = sum(base.observations.num_of(image) for image in images)
-    of_fields = met.sq_length, 0.5 * (gram + gram.T), met.sums.score, meat, met.num_points
-    return CandidateScores(*of_fields, right[:-1], coupling.support, solution, num_observations)
+    return met.scores(solution, meat)
 
 
-def scores_everywhere(base: Base, image: int, fields: FieldsInParts) -> tuple[CandidateScores, FloatArray]:
-    """Return the scores of fields of one image, without their meat, and (D + m, c) S^+ R at all columns of the base."""
-    met = _Met(base, [image], lambda _: fields, keep_scores=False)
-    right, support = met.right[:-1], met.coupling.support
-    solution = base.inverse.times(support, right)
-    own = solution[support]
-    gram = met.gram - right.T @ own
-    of_fields = met.sq_length, 0.5 * (gram + gram.T), met.sums.score, np.full(gram.shape, np.nan), met.num_points
-    num_observations = base.observations.num_of(image)
-    return CandidateScores(*of_fields, right, support, own, num_observations), solution
+class FieldsMet:
+    """What candidate fields meet: N^T E off the points, and their products among each other; see `candidate_scores`.
 
-
-class _Met:
-    """What candidate fields meet: N^T E off the points, and their products among each other.
-
-    right: (s + 1, c) R and a row of padding.    gram: (c, c) E^T E - (J^T E)^T V^-1 (J^T E).    sq_length: (c,).
+    support: (s,).    right: (s, c) R.    gram: (c, c) E^T E - (J^T E)^T V^-1 (J^T E).    sq_length: (c,).
     kept_scores: of the views, where they are asked for and at hand.
     """
 
@@ -140,11 +124,11 @@ class _Met:
         images: Sequence[int],
         fields_of: Callable[[int], ImageFields | FieldsInParts],
         *,
-        keep_scores: bool,
+        keep_scores: bool = False,
     ) -> None:
         observations = base.observations
         points = _points_of(base, images)
-        self.num_points = points.size
+        self._num_tracks, self._num_observations = points.size, sum(observations.num_of(image) for image in images)
         self.in_parts = any(observations.num_of(image) > AT_ONCE for image in images)
         self.parts = _parts(points.size) if self.in_parts else [slice(0, points.size)]
         self.around = _Surroundings(base, points, self.parts)
@@ -156,9 +140,17 @@ class _Met:
             absorbed = self.sums.add(part, in_parts=self.in_parts)
             for own, near in self.around.of(part) if not observations.points_independent else ():
                 self.kept_scores = self.coupling.subtract_tracks(self.sums.right, near, absorbed[own], keep=keep)
-        self.right, self.gram, self.sq_length = self.sums.right, self.sums.gram, self.sums.gram.diagonal().copy()
+        self.right, self.support, self.gram = self.sums.right[:-1], self.coupling.support, self.sums.gram
+        self.sq_length = self.gram.diagonal().copy()
         for gone in self.sums.eliminated:
             self.gram -= gone
+
+    def scores(self, solution: FloatArray, meat: FloatArray) -> CandidateScores:
+        """Return the fields' scores; ``solution`` (s, c) is B, ``meat`` (c, c) that of the tracks."""
+        gram = self.gram - self.right.T @ solution
+        of_fields = self.sq_length, 0.5 * (gram + gram.T), self.sums.score, meat
+        at = self.right, self.support, solution
+        return CandidateScores(*of_fields, self._num_tracks, *at, self._num_observations)
 
 
 def _points_of(base: Base, images: Sequence[int]) -> IntArray:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from sfm_audit.audit.joint.candidates import FieldsInParts, ImageFields, scores_everywhere
+from sfm_audit.audit.joint.candidates import FieldsInParts, FieldsMet, ImageFields
 from sfm_audit.audit.joint.group_test import KEPT_EIGENVALUE, group_root
+from sfm_audit.audit.joint.inverse import DenseInverse, JointInverse
 from sfm_audit.audit.joint.neighbourhood import sum_by_track
 from sfm_audit.audit.joint.sums import joint_sums, moved_by
 from sfm_audit.audit.joint.system import Base, IncludedFields, with_step
 from sfm_audit.audit.kernels.joint_inclusion import take_change
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray, distinct
+
+_COLUMNS_AT_ONCE: Final = 300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +60,9 @@ def include(base: Base, candidates: list[Candidate]) -> Base:
     theta = K^+ u with K of all new fields together (those of two images meet in shared points), step -> step - B
     theta, and the inverse gets a border. Directions of K with unit columns below 1e-4 stay out, as in the test.
     """
-    new = [_independent(base, each) for each in candidates]
+    met = [FieldsMet(base, [each.image_idx], _in_parts(each)) for each in candidates]
+    solved = zip(candidates, met, _solutions(base.inverse, met), strict=True)
+    new = [_independent(*each) for each in solved]
     starts = np.cumsum([0, *(own.gram.shape[0] for own in new)])
     size = base.inverse.size
     solution = np.concatenate([own.solution for own in new], axis=1)
@@ -85,9 +90,32 @@ def _with_change(base: Base, grown: Base, step: FloatArray) -> Base:
     return with_step(grown, step) if found is None else replace(grown, step=step, point_step=found[0], left_px=found[1])
 
 
-def _independent(base: Base, candidate: Candidate) -> _New:
+def _in_parts(candidate: Candidate) -> Callable[[int], FieldsInParts]:
+    return lambda _: FieldsInParts(candidate.part)
+
+
+def _solutions(inverse: JointInverse, met: list[FieldsMet]) -> Iterator[FloatArray]:
+    """(D + m, c) S^+ R of each image's fields; those of several are solved for together where S^+ is a band."""
+    batch: list[FieldsMet] = []
+    for k, own in enumerate(met):
+        batch.append(own)
+        num = sum(each.right.shape[1] for each in batch)
+        if k + 1 < len(met) and num < _COLUMNS_AT_ONCE and not isinstance(inverse.main, DenseInverse):
+            continue
+        support = distinct(np.concatenate([each.support for each in batch]))
+        right, start = np.zeros((support.size, num)), 0
+        for each in batch:
+            stop = start + each.right.shape[1]
+            right[np.searchsorted(support, each.support), start:stop] = each.right
+            start = stop
+        solution = inverse.times(support, right)
+        yield from np.split(solution, np.cumsum([each.right.shape[1] for each in batch])[:-1], axis=1)
+        batch = []
+
+
+def _independent(candidate: Candidate, met: FieldsMet, solution: FloatArray) -> _New:
     """The directions of a candidate's fields that the base leaves, in units in which K = 1."""
-    scores, solution = scores_everywhere(base, candidate.image_idx, FieldsInParts(candidate.part))
+    scores = met.scores(solution[met.support], np.full(met.gram.shape, np.nan))
     root = group_root(scores, slice(0, candidate.fields.shape[2]))
     gram = root @ scores.gram @ root.T
     turned = (each @ root.T for each in (scores.coupling, solution))

@@ -11,6 +11,7 @@ from joint_reference import SPEC, model_of, system_of
 from numpy.testing import assert_allclose
 
 from sfm_audit.audit.joint import inclusion, misfit
+from sfm_audit.audit.joint.banded_inverse import BandedInverse
 from sfm_audit.audit.joint.inclusion import Candidate, include
 from sfm_audit.audit.joint.sums import joint_sums
 from sfm_audit.audit.joint.system import with_step
@@ -52,6 +53,18 @@ def test_residuals_are_those_of_the_whole_step(system, monkeypatch):
         assert_allclose(base.point_step, expected.point_step, atol=1e-9 * np.abs(expected.point_step).max())
         assert np.abs(base.left_px - system.base.left_px).max() > 1e-6
     assert len(calls) == len(ROUNDS)
+
+
+@pytest.mark.parametrize("at_once", [1, 10])
+def test_fields_solved_for_together_are_those_of_one_after_the_other(monkeypatch, at_once):
+    spec = dataclasses.replace(SPEC, num_images=60, points_per_image=60, max_neighbours=3, max_track_length=4)
+    system = system_of(model_of(spec, seed=2))
+    assert isinstance(system.base.inverse.main, BandedInverse)
+    together = grown(system)
+    monkeypatch.setattr(inclusion, "_COLUMNS_AT_ONCE", at_once)
+    for one, other in zip(grown(system), together, strict=True):
+        assert_allclose(one.step, other.step, atol=1e-9 * np.abs(other.step).max())
+        assert_allclose(one.left_px, other.left_px, atol=1e-9 * np.abs(other.left_px).max())
 
 
 def test_both_paths_include_alike(system):
