@@ -23,7 +23,7 @@ GRID_POINTS = 256  # of a map of expected errors, of one camera or several: rays
 
 @pytest.fixture
 def projected(monkeypatch):
-    """Sizes of all that is projected from now on, by numpy or by the kernel, measurement grids apart."""
+    """Sizes of all that is projected from now on, measurement grids and the kernel's distortion columns apart."""
     sizes = []
     plane = projection._plane
 
