@@ -194,7 +194,8 @@ INLINE void add_normal_row(
     const double *dx = m->design + row * 2 * width, *inverse = of->inverse[0] + 9 * point, *plain = of->inverse[1] + 9 * point;
     double w[2] = {m->weight[row], of->plain[image]}, absorbed[3 * MOST_COLUMNS], other[3 * MOST_COLUMNS];
     /* of a point whose weights are the same, the inverses are, to the last bit */
-    int differs = memcmp(inverse, plain, 9 * sizeof *inverse) != 0;
+    int differs = 0;
+    for (int i = 0; i < 9; i++) differs |= inverse[i] != plain[i];
     wide_rows own, moved, more;
     turn_row(dx, width, turn, padded, &own);
     absorb_row(dx + 3, dx + width + 3, &own, padded, w[0], inverse, absorbed);
