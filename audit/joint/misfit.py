@@ -240,20 +240,24 @@ class _Rounds:
         self._beside.take(image, missing())
         return own
 
-    def _significant(self, image: int) -> list[MisfitGroup]:
-        return [group for k, group in enumerate(GROUPS) if self._q[image, k] < self._alpha]
+    def _significant(self) -> dict[int, list[MisfitGroup]]:
+        """Groups with q < alpha, of each image that has any."""
+        out: dict[int, list[MisfitGroup]] = {}
+        for image, k in np.argwhere(self._q < self._alpha).tolist():
+            out.setdefault(image, []).append(GROUPS[k])
+        return out
 
     def _effects(self) -> FloatArray:
         """(I,) largest effect among significant groups."""
         out = np.zeros(len(self.tests))  # nothing is significant where nothing was tested
-        for i in np.flatnonzero((self._q < self._alpha).any(axis=1)).tolist():
-            out[i] = max((self.tests[i][group].px for group in self._significant(i)), default=0.0)
+        for image, significant in self._significant().items():
+            out[image] = max(self.tests[image][group].px for group in significant)
         return out
 
     def _include(self, new: BoolArray) -> None:
-        candidates, observations = [], self._system.observations
+        candidates, observations, significant = [], self._system.observations, self._significant()
         for image in np.flatnonzero(new).tolist():
-            own = GROUP_COLUMNS[max(self._significant(image), key=lambda g: self.tests[image][g].px)]
+            own = GROUP_COLUMNS[max(significant[image], key=lambda g: self.tests[image][g].px)]
             parts = (_columns_of(self._system, image, chosen=part)[:, :, own] for part in observations.parts(image))
             candidates.append(Candidate(image, np.concatenate(list(parts)), partial(observations.nuisance, image)))
         self._base = include(self._base, candidates)
@@ -277,8 +281,8 @@ class _Rounds:
         causes: list[MisfitGroup | None] = [None] * len(tests)
         for image in np.flatnonzero(self._tested).tolist():
             tests[image] = self._joint_tests(image)
-        for image in np.flatnonzero((self._q < self._alpha).any(axis=1)).tolist():
-            causes[image] = self._cause(image, tests[image])
+        for image, significant in self._significant().items():
+            causes[image] = self._cause(image, significant, tests[image])
         effect = np.where(self._tested, self._effects(), np.nan)
         return JointMisfit(tuple(tests), effect, self._round >= 0, tuple(self._round.tolist()), tuple(causes), most)
 
@@ -289,11 +293,10 @@ class _Rounds:
             for k, (group, t) in enumerate(self.tests[image].items())
         }
 
-    def _cause(self, image: int, tests: JointTests) -> MisfitGroup | None:
-        significant = self._significant(image)
+    def _cause(self, image: int, significant: list[MisfitGroup], tests: JointTests) -> MisfitGroup:
         material = [group for group in significant if tests[group].px > self._tau_px[image]]
         n = self._system.observations.num_of(image)
-        return max(material or significant, key=lambda group: tests[group].bic(n), default=None)
+        return max(material or significant, key=lambda group: tests[group].bic(n))
 
 
 def _fields_of(
