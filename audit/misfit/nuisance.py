@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from sfm_audit.audit.inliers.projected import ProjectedImage
@@ -9,6 +11,7 @@ from sfm_audit.loaders.arrays import FloatArray
 from sfm_audit.loaders.camera_models import CameraModel
 
 
+@cache
 def fitted_param_idxs(model: CameraModel) -> tuple[int, ...]:
     """Return the parameters that COLMAP refines by default: all but the principal point (spherical models: none)."""
     if model.is_spherical:

@@ -72,5 +72,5 @@ def test_zeros_begin_with_a_line_of_the_cache(shape):
     zeros = aligned_zeros(shape)
     assert zeros.shape == shape
     assert zeros.flags.c_contiguous
-    assert zeros.ctypes.data % 64 == 0
+    assert not zeros.size or zeros.ctypes.data % 64 == 0  # an empty array lies anywhere
     assert not zeros.any()

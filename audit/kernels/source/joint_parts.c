@@ -119,21 +119,20 @@ KERNEL int64_t joint_designs(
             }
             const double *p = xyz + 3 * point_idx[source[k]], *seen = observed + 2 * observation_row[source[k]];
             double x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
-            double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
+            double z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2], along[2];
             for (int axis = 0; axis < 2; axis++) {
                 const double *of_point = jacobian + 3 * axis * total + source[k];
                 double *to = out + (2 * k + axis) * width, j[3] = {of_point[0], of_point[total], of_point[2 * total]}, cam[3];
                 for (int i = 0; i < 3; i++) cam[i] = inverse[i] * j[0] + inverse[3 + i] * j[1] + inverse[6 + i] * j[2];
                 to[0] = cam[2] * y - cam[1] * z, to[1] = cam[0] * z - cam[2] * x, to[2] = cam[1] * x - cam[0] * y;
                 to[3] = j[0], to[4] = j[1], to[5] = j[2];
-                for (int64_t c = 0; c < width - 6; c++) {
-                    double value = 0.0;
-                    if (own[c] >= 3) value = of_image[(2 * (own[c] - 3) + axis) * count + source[k] - first[image]];
-                    else if (own[c] == 0 || own[c] == axis + 1) {
-                        value = (seen[axis] - residuals[axis * total + source[k]] - centre[axis]) / focal[axis];
-                    }
-                    to[6 + c] = value;
-                }
+                along[axis] = (seen[axis] - residuals[axis * total + source[k]] - centre[axis]) / focal[axis];
+            }
+            for (int64_t c = 0; c < width - 6; c++) {
+                const double *other = own[c] < 3 ? along : of_image + 2 * (own[c] - 3) * count + source[k] - first[image];
+                double *to = out + 2 * k * width + 6 + c;
+                to[0] = own[c] == 0 || own[c] == 1 || own[c] >= 3 ? other[0] : 0.0;
+                to[width] = own[c] == 0 || own[c] == 2 || own[c] >= 3 ? other[own[c] < 3 ? 1 : count] : 0.0;
             }
         }
     }
