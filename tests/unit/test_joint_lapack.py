@@ -161,7 +161,9 @@ def test_what_was_not_a_number_is_gone_where_nothing_of_it_is_kept():
     out = np.full((2, 2), np.nan)
     add_product(out, np.eye(2), np.eye(2), keep=0.0)
     assert_array_equal(out, np.eye(2))
-    add_both(np.full((2, 2), np.nan, order="F"), np.eye(2), np.eye(2), keep=0.0)
+    out = np.full((2, 2), np.nan, order="F")
+    add_both(out, np.eye(2), np.eye(2), keep=0.0)
+    assert_array_equal(np.tril(out), 2.0 * np.eye(2))
 
 
 @pytest.mark.parametrize("shape", [(4, 3), (1, 5), (3, 1), (3, 0), (0, 2)])
