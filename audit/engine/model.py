@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from sfm_audit.audit.engine.jointly import (
     untested_misfit,
 )
 from sfm_audit.audit.engine.observations import observation_table
-from sfm_audit.audit.engine.quality import quality_of_images
+from sfm_audit.audit.engine.quality import quality_of_images, suspects_of
 from sfm_audit.audit.engine.rows import camera_columns, model_row
 from sfm_audit.audit.engine.spreading import Spread, in_turn
 from sfm_audit.audit.engine.tables import ModelAudit, Said, images_table, triage_rows
@@ -43,7 +44,7 @@ from sfm_audit.audit.inliers.frames import claimed_frames
 from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
-from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly
+from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly, included_from
 from sfm_audit.audit.kernels.threads import together
 from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
@@ -85,12 +86,18 @@ class ModelAuditor:
         self.model, self._given, self._spread = model, given, spread
         self.config = config or AuditConfig()
         self._keypoint_scale_px = keypoint_scale_px
+        self._looking = RLock()
         if self.config.noise == "keypoint" and keypoint_scale_px is None:
             raise ValueError("the noise model keypoint needs keypoint_scale_px")
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out where images are audited: an unpickled auditor runs serially."""
-        return {**self.__dict__, "_spread": in_turn, "_given": NOTHING_GIVEN}
+        kept = {name: value for name, value in self.__dict__.items() if name != "_looking"}
+        return {**kept, "_spread": in_turn, "_given": NOTHING_GIVEN}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take what was kept, with a lock of its own."""
+        self.__dict__.update(state, _looking=RLock())
 
     @cached_property
     def residuals(self) -> ModelResiduals:
@@ -137,9 +144,14 @@ class ModelAuditor:
         """Materiality of a misfit in each image (I,), px; NaN where the noise is unknown and tau is in sigma."""
         return np.array([self.config.tau_px(float(sigma)) for sigma in self.sigma_constant_px], dtype=np.float64)
 
-    @cached_property
+    @property
     def quality(self) -> tuple[CameraQuality | None, ...]:
         """What each image says of its camera as the model stands; None without inliers."""
+        with self._looking:  # the joint step asks while another thread may be about to find out
+            return self._quality
+
+    @cached_property
+    def _quality(self) -> tuple[CameraQuality | None, ...]:
         _ = self.sigma_constant_px  # with the residuals, what the images share
         return tuple(self._spread(_quality_of, self))
 
@@ -167,6 +179,7 @@ class ModelAuditor:
             tau_px=self.tau_px,
             excluded=self.moved,
             left_out=self.consistency.inconsistent,
+            suspects=lambda: suspects_of(self.quality, self.config.alpha, included_from(self.tau_px)),
             frame_idx=None if frames is None else frames.frame_idx,
             image_from_frame=None if frames is None else frames.image_from_frame,
             points_independent=self.config.points == "independent",
@@ -381,6 +394,5 @@ def audit_model(
 
 
 def _quality_of(auditor: ModelAuditor, image_idxs: range) -> list[CameraQuality | None]:
-    """What some images say of their cameras."""
-    sigma_px = auditor.sigma_constant_px
-    return quality_of_images(auditor.model, auditor.residuals, sigma_px, image_idxs, grid=auditor.config.grid)
+    noise_px, grid = auditor.sigma_constant_px, auditor.config.grid
+    return quality_of_images(auditor.model, auditor.residuals, noise_px, image_idxs, grid=grid)

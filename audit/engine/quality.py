@@ -27,12 +27,30 @@ from sfm_audit.audit.kernels.spread import Inliers, image_spread
 from sfm_audit.audit.misfit import MisfitTests, nuisance_columns
 from sfm_audit.audit.misfit.images import misfit_of_images
 from sfm_audit.audit.misfit.in_parts import AT_ONCE
+from sfm_audit.audit.misfit.significance import UNTESTED, Significance
 from sfm_audit.audit.misfit.sums import ModelSums
-from sfm_audit.loaders.arrays import FloatArray, IntArray
+from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel, moved
 
 _MAX_POINTS_AT_ONCE: Final = 4096
 _POINTS_IN_A_TURN: Final = 1 << 16
+_SUSPECT_FROM: Final = 0.5  # of the effect that an image is included from: its points have taken up a part
+
+
+def suspects_of(qualities: Sequence[CameraQuality | None], alpha: float, included_from_px: FloatArray) -> BoolArray:
+    """Return the images (I,) whose camera does not explain their points, taken as given: who may be wrong.
+
+    Parameters
+    ----------
+    included_from_px : (I,) the effect from which the joint test includes an image, NaN never
+
+    Notes
+    -----
+    Such an image may be wrong, or a neighbour of a wrong one, which its points follow: this rejects nobody.
+    """
+    found = Significance.of([UNTESTED if each is None else each.misfit for each in qualities])
+    is_large = found.px > _SUSPECT_FROM * included_from_px[:, None]
+    return np.asarray(((found.q < alpha) & is_large).any(axis=1))
 
 
 def quality_of_images(

@@ -4,7 +4,7 @@ from sfm_audit.audit.inliers.frames import image_from_frame
 from sfm_audit.audit.joint.audit import JointAudit, audit_jointly
 from sfm_audit.audit.joint.blocks import covisible_blocks
 from sfm_audit.audit.joint.implied import Implied, ImpliedParameter, implied_parameters
-from sfm_audit.audit.joint.misfit import JointMisfit, JointTest, JointTests, joint_misfit
+from sfm_audit.audit.joint.misfit import JointMisfit, JointTest, JointTests, included_from, joint_misfit
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
 from sfm_audit.audit.joint.poses import PoseCovariance, PoseGauge, pose_covariances, pose_gauge
 from sfm_audit.audit.joint.system import JointSystem, joint_system
@@ -28,6 +28,7 @@ __all__ = [
     "image_from_frame",
     "image_gains",
     "implied_parameters",
+    "included_from",
     "joint_misfit",
     "joint_system",
     "own_parameters",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sfm_audit.audit.joint.again import implied_again
 from sfm_audit.audit.joint.blocks import Block, covisible_blocks
 from sfm_audit.audit.joint.implied import ImpliedBeside, ImpliedParameter, implied_of_cameras, implied_of_sizes
 from sfm_audit.audit.joint.layout import median_of
-from sfm_audit.audit.joint.misfit import JointMisfit, joint_misfit
+from sfm_audit.audit.joint.misfit import Beside, JointMisfit, joint_misfit
 from sfm_audit.audit.joint.observations import usable_images
 from sfm_audit.audit.joint.own import CameraStep, Gains, image_gains, own_parameters
 from sfm_audit.audit.joint.poses import PoseCovariance, pose_covariances, unknown_pose
@@ -58,6 +59,7 @@ def audit_jointly(
     tau_px: FloatArray,
     excluded: BoolArray | None = None,
     left_out: BoolArray | None = None,
+    suspects: Callable[[], BoolArray] | None = None,
     frame_idx: IntArray | None = None,
     image_from_frame: FloatArray | None = None,
     points_independent: bool = False,
@@ -72,10 +74,12 @@ def audit_jointly(
     excluded : (I,) images that are wrong in another way (pose); they and the images of cameras with a material own
         step are not tested for misfit, see `joint_misfit`
     left_out : (I,) images that take no part at all (section 12)
+    suspects : gives (I,) images that are tested first, see `joint_misfit`; asked when the system stands
     frame_idx, image_from_frame, points_independent : see `joint_system`
     max_columns : of one dense system
     with_poses : whether to say how well poses are known
     """
+    tests = _Tests(alpha, tau_px, excluded, suspects)
     usable = usable_images(model, residuals, sigma_px) & (True if left_out is None else ~left_out)
     blocks = covisible_blocks(model, residuals, max_columns, frame_idx, usable)
 
@@ -91,29 +95,37 @@ def audit_jointly(
                 left_out=~block.members if left_out is None else ~block.members | left_out,
                 points_independent=points_independent,
             )
-            out.append(_of_block(system, block, alpha, tau_px, excluded, with_poses=with_poses))
+            out.append(_of_block(system, block, tests, with_poses=with_poses))
         return out
 
     parts = [part for some in over_ranges(answers, len(blocks), range_weight=1.0) for part in some]
     return parts[0][1] if len(parts) == 1 else _merged(parts, tau_px)
 
 
-def _of_block(
-    system: JointSystem,
-    block: Block,
-    alpha: float,
-    tau_px: FloatArray,
-    excluded: BoolArray | None,
-    *,
-    with_poses: bool,
-) -> tuple[Block, JointAudit]:
+class _Tests(NamedTuple):
+    """How images are tested, see `audit_jointly`."""
+
+    alpha: float
+    tau_px: FloatArray
+    excluded: BoolArray | None
+    suspects: Callable[[], BoolArray] | None
+
+    def misfit(self, system: JointSystem, excluded: BoolArray, beside: Beside) -> JointMisfit:
+        """Test the images of a system but those that are excluded."""
+        suspects = None if self.suspects is None else self.suspects()
+        return joint_misfit(
+            system, alpha=self.alpha, tau_px=self.tau_px, excluded=excluded, suspects=suspects, beside=beside
+        )
+
+
+def _of_block(system: JointSystem, block: Block, tests: _Tests, *, with_poses: bool) -> tuple[Block, JointAudit]:
     core = np.flatnonzero(block.core).tolist()
     asked = np.flatnonzero(block.core | block.members).tolist()  # of all members: their cameras have steps, too
     covariances_of_members = dict(zip(asked, system.image_covariances(asked), strict=True))
     steps = own_parameters(system, covariances_of_members)
     covariance_of = {image: covariances_of_members[image] for image in core}
-    out = np.zeros(len(block.core), dtype=bool) if excluded is None else excluded.copy()
-    material = [step for step in steps if step.is_material(median_of(tau_px, step.image_idxs))]
+    out = np.zeros(len(block.core), dtype=bool) if tests.excluded is None else tests.excluded.copy()
+    material = [step for step in steps if step.is_material(median_of(tests.tau_px, step.image_idxs))]
     for step in material:
         out[step.image_idxs] = True
     settled = {step.camera_idx: step for step in implied_again(system, material)}
@@ -127,7 +139,7 @@ def _of_block(
     misfits: list[JointMisfit] = []
     of_sizes: list[ImpliedParameter] = []
     together(
-        lambda: misfits.append(joint_misfit(system, alpha=alpha, tau_px=tau_px, excluded=out, beside=beside)),
+        lambda: misfits.append(tests.misfit(system, out, beside)),
         lambda: of_sizes.extend(implied_of_sizes(system, steps)),
     )
     misfit, implied = misfits[0], [*implied_of_cameras(system, steps, beside.found()), *of_sizes]

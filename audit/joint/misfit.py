@@ -29,6 +29,7 @@ from sfm_audit.loaders.model import CameraRecord
 MAX_ROUNDS: Final = 8
 _INCLUDE_FROM_PX: Final = 0.1
 _SHARE_OF_LARGEST: Final = 0.5
+_MOST_SUSPECTS: Final = 0.1
 
 
 OfImage = GroupSumsOfImage | CandidateScores | None
@@ -81,7 +82,7 @@ class JointMisfit:
 
 
 class Beside(Protocol):
-    """Who wants other fields of an image projected off the base as it was before anything was included."""
+    """Who wants other fields of an image projected off the base at the image's first test."""
 
     def fields(
         self, image_idx: int, camera: CameraRecord, projected: ProjectedImage, candidates: FloatArray
@@ -104,6 +105,7 @@ def joint_misfit(
     alpha: float,
     tau_px: FloatArray,
     excluded: BoolArray | None = None,
+    suspects: BoolArray | None = None,
     beside: Beside | None = None,
 ) -> JointMisfit:
     """Test all images against everything that was or could be fitted, and free the fields of those that fail.
@@ -114,7 +116,10 @@ def joint_misfit(
     excluded : (I,) images that are wrong in another way (pose, own parameters). They keep their free pose and own
         parameters, so that they pull at nobody, but are neither tested nor counted. Ignored if they are more than
         half of the images with columns: then it is not they that are wrong.
-    beside : asked once for every image that is tested
+    suspects : (I,) images that are tested first, and included where they fail, before anybody else is tested. They
+        decide on the order alone: everybody is tested in the end. All at once where None, where nobody is suspected,
+        or more than a tenth are: then they are rather neighbours of wrong images, and do not say who is wrong.
+    beside : asked once for every image that is tested, at its first test
 
     Notes
     -----
@@ -125,17 +130,26 @@ def joint_misfit(
     with the largest effect as parameters of their own; at most 8 rounds; not if more than half of the tested images
     would then be included. An included image keeps its tests and is no hypothesis any more. Only images that share
     points with an included one are tested again: what an included field did to others it did through shared points.
-    Between two rounds these are the ones with any p < alpha; all others when nobody is left to include, and if that
-    finds somebody, rounds go on.
+    Between two rounds these are the ones with any p < alpha; all others, and who was not tested yet, when nobody is
+    left to include, and if that finds somebody, rounds go on. Until then those that were not tested count as images
+    with p = 1 (`benjamini_hochberg`): looking at suspects alone makes nobody more significant.
     """
     has_columns = system.observations.layout.has_columns
     left_out = np.zeros_like(has_columns) if excluded is None else excluded & has_columns
     if 2 * np.count_nonzero(left_out) > np.count_nonzero(has_columns):
         left_out = np.zeros_like(has_columns)
-    rounds = _Rounds(system, has_columns & ~left_out, alpha=alpha, tau_px=tau_px, beside=beside)
+    tested = has_columns & ~left_out
+    rounds = _Rounds(system, tested, alpha=alpha, tau_px=tau_px, beside=beside)
     nothing = {out: _nothing(out) for out in (False, True)}
     rounds.tests = [nothing[out] for out in left_out.tolist()]  # who is tested has an answer soon
-    return rounds.run()
+    first = tested & (tested if suspects is None else suspects)
+    is_few = 0 < np.count_nonzero(first) <= _MOST_SUSPECTS * np.count_nonzero(tested)
+    return rounds.run(first if is_few else tested)
+
+
+def included_from(tau_px: FloatArray) -> FloatArray:
+    """Return the effect (I,) above which an image is included, px; tau_px (I,), NaN where never material."""
+    return np.fmin(_INCLUDE_FROM_PX, 0.5 * tau_px)
 
 
 def _nothing(left_out: bool) -> dict[MisfitGroup, GroupTest]:
@@ -154,18 +168,18 @@ class _Rounds:
         self._many = scores_of_many(system, self._base)
         self._tested, self._alpha, self._beside = tested, alpha, beside
         self._tau_px = np.where(np.isnan(tau_px), np.inf, tau_px)
-        self._include_from = np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)
+        self._include_from = included_from(self._tau_px)
         self.tests: list[dict[MisfitGroup, GroupTest]] = []
         self._worth: list[dict[MisfitGroup, Worth]] = [{}] * num_images
         self._q = np.full((num_images, len(GROUPS)), np.nan)
         self._least_p = np.full(num_images, np.nan)  # of all groups of an image
+        self._asked = np.zeros(num_images, dtype=bool)
         self._round = np.full(num_images, -1)
 
-    def run(self) -> JointMisfit:
-        """Test, include, test again."""
-        self._test(self._tested)
-        self._beside = None  # from here on the base may be another
-        stale = np.zeros_like(self._tested)  # share points with what was included since they were tested
+    def run(self, first: BoolArray) -> JointMisfit:
+        """Test the first, include, test again, and everybody else."""
+        self._test(first)
+        stale = self._tested & ~first  # were not tested since something was included that they share points with
         for number in range(MAX_ROUNDS):
             new = self._next()
             if not new.any() and stale.any():
@@ -203,41 +217,44 @@ class _Rounds:
                 self.tests[image], self._worth[image] = answer
 
         over_ranges(tested, len(images), counts)
+        self._asked |= chosen
         waiting = np.flatnonzero(self._tested & (self._round < 0))
         p = np.array([[self.tests[i][group].p for group in GROUPS] for i in waiting.tolist()]).reshape(-1, len(GROUPS))
+        p[~self._asked[waiting]] = 1.0
         self._q[waiting] = benjamini_hochberg(holm(p).T).T
         self._least_p[waiting] = np.fmin.reduce(p, axis=1)
 
     def _scores_of(self, images: Sequence[int]) -> list[OfImage]:
         """Of each image, what its tests ask for."""
-        powers = [0 if self._beside is None else self._beside.power(image) for image in images]
+        beside = [None if self._asked[image] else self._beside for image in images]
+        powers = [0 if each is None else each.power(image) for image, each in zip(images, beside, strict=True)]
         compiled = [None] * len(images) if self._many is None else self._many.tested(images, powers)
         out: list[OfImage] = []
-        for image, power, found in zip(images, powers, compiled, strict=True):
+        for image, each, power, found in zip(images, beside, powers, compiled, strict=True):
             if found is None:
-                out.append(self._by_numpy(image))
+                out.append(self._by_numpy(image, each))
                 continue
             own, missing = (found, found.missing) if isinstance(found, GroupSumsOfImage) else _divided(found)
-            if power and self._beside is not None:
-                self._beside.take(image, missing())
+            if power and each is not None:
+                each.take(image, missing())
             out.append(own)
         return out
 
-    def _by_numpy(self, image: int) -> CandidateScores | None:
+    def _by_numpy(self, image: int, beside: Beside | None) -> CandidateScores | None:
         fields: ImageFields | FieldsInParts
         if self._system.observations.num_of(image) <= AT_ONCE:
-            fields = _fields_of(self._system, image, self._beside)
+            fields = _fields_of(self._system, image, beside)
             is_empty = not fields.fields.size
         else:
-            fields = FieldsInParts(partial(_fields_of, self._system, image, self._beside))
+            fields = FieldsInParts(partial(_fields_of, self._system, image, beside))
             is_empty = not fields.part(slice(1)).fields.size
         if is_empty:
             return None
         scores = candidate_scores(self._base, [image], lambda _: fields)
-        if self._beside is None:
+        if beside is None:
             return scores
         own, missing = _divided(scores)
-        self._beside.take(image, missing())
+        beside.take(image, missing())
         return own
 
     def _significant(self) -> dict[int, list[MisfitGroup]]:

@@ -162,7 +162,7 @@ class Lanes(Generic[K]):
         while True:
             lane = self._idle.pop() if self._idle else _open_lane()
             try:
-                lane.connection.send((function, arguments))
+                lane.connection.send((function, arguments, limits[0] is not None))
             except (BrokenPipeError, ConnectionError):  # killed while it was idle
                 _bury(lane)
                 continue
@@ -238,7 +238,7 @@ def _serve(connection: Connection) -> None:
     while True:
         try:
             with importing_audits():  # the first call's function is imported when it arrives
-                function, arguments = connection.recv()
+                function, arguments, is_limited = connection.recv()
         except (EOFError, OSError):
             leaving()
             return
@@ -253,7 +253,7 @@ def _serve(connection: Connection) -> None:
         except (BrokenPipeError, ConnectionError):
             return
         del function, arguments, answer
-        give_back()
+        give_back(is_limited=is_limited)
 
 
 def _end_with_parent() -> None:

@@ -1,8 +1,9 @@
 """Freed memory: kept by processes of ours for what comes next, and given back between two models where it is much.
 
 glibc gives a freed array back to the system and asks for another one a moment later; the system clears its pages each
-time, which was a tenth of an audit. Only where glibc allocates, and only in processes that do nothing but our work: the
-command line and its workers. Whoever imports the library keeps the allocator as it was.
+time, which was a tenth of an audit. A model that follows asks for as much again: what is kept is much where it is more
+than a sixteenth of what the machine has left. Only where glibc allocates, and only in processes that do nothing but our
+work: the command line and its workers. Whoever imports the library keeps the allocator as it was.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ _MALLOPT: Final = {  # by the numbers of glibc's malloc.h
     -8: 1,  # M_ARENA_MAX: what one thread freed is there for the others, who seldom ask at the same time
 }
 _KEPT_BYTES: Final = 200_000_000  # imports take 80 million, a model of 20 images as much again
+_KEPT_SHARE: Final = 16  # of what is available
 _SIZES: Final = Path("/proc/self/statm")
+_OF_MACHINE: Final = Path("/proc/meminfo")
+_OF_GROUP: Final = Path("/sys/fs/cgroup")  # of a container, which sees its own
 
 
 def keep_freed() -> bool:
@@ -32,9 +36,13 @@ def keep_freed() -> bool:
     return mallopt is not None and all(mallopt(name, value) == 1 for name, value in _MALLOPT.items())
 
 
-def give_back() -> bool:
-    """Give back what was kept, if it is much, between two models: the next may be small; return whether it was much."""
-    if _private_bytes() <= _KEPT_BYTES:
+def give_back(*, is_limited: bool = False) -> bool:
+    """Give back what was kept, if it is much, between two models: the next may be small; return whether it was much.
+
+    is_limited: somebody watches how much this process takes; above 200 MB is then much however much there is.
+    """
+    kept = _private_bytes()
+    if kept <= _KEPT_BYTES or (not is_limited and kept * _KEPT_SHARE <= _available_bytes()):
         return False
     trim = _of_glibc("malloc_trim")
     return trim is not None and bool(trim(0))
@@ -47,6 +55,20 @@ def _private_bytes() -> int:
     except OSError:
         return 0
     return (resident - shared) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _available_bytes() -> int:
+    """Return how much memory is left on this machine, or to the group of processes; 0 where nobody says."""
+    try:
+        lines = _OF_MACHINE.read_text(encoding="ascii").splitlines()
+        left = next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, IndexError, StopIteration):
+        return 0
+    try:
+        most, taken = (int((_OF_GROUP / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
+    except (OSError, ValueError):  # no limit is the word "max"
+        return left
+    return min(left, most - taken)
 
 
 def _of_glibc(name: str) -> Any:

@@ -9,7 +9,8 @@ from scripts.mutation.mutants import Named, Target
 DECISION: Final = tuple(f"unit/test_decision_{name}.py" for name in ("table", "reasons", "severity", "cause"))
 NUMBERS: Final = ("unit/test_decision_numbers.py",)
 LIMITS: Final = ("unit/test_consistency_limits.py", "unit/test_consistency.py")
-ROUNDS: Final = ("unit/test_joint_rounds.py",)
+ROUNDS: Final = ("unit/test_joint_rounds.py", "unit/test_joint_group.py")
+SUSPECTS: Final = ("unit/test_suspects.py",)
 GATE: Final = ("unit/test_gate.py::test_limits_of_a_scene_that_is_lost_are_not_met",)
 BANDS: Final = ("unit/test_gate_bands.py",)
 FINISHED: Final = tuple(
@@ -141,11 +142,13 @@ TARGETS: Final = (
             "MAX_EFFECT_OVER_RMS",
         ),
     ),
+    Target("audit/engine/quality.py", SUSPECTS, ("_SUSPECT_FROM", "suspects_of")),
     Target(
         "audit/joint/misfit.py",
         ROUNDS,
         (
-            *("MAX_ROUNDS", "_INCLUDE_FROM_PX", "_SHARE_OF_LARGEST", "joint_misfit", "_nothing", "_Rounds.__init__"),
+            *("MAX_ROUNDS", "_INCLUDE_FROM_PX", "_SHARE_OF_LARGEST", "_MOST_SUSPECTS"),
+            *("joint_misfit", "included_from", "_nothing", "_Rounds.__init__"),
             *(
                 "_Rounds.run",
                 "_Rounds._next",
@@ -206,8 +209,8 @@ NAMED: Final = (
     Named(
         "fields are admitted from 0.1 px on whatever tau is",
         "audit/joint/misfit.py",
-        "np.minimum(_INCLUDE_FROM_PX, 0.5 * self._tau_px)",
-        "np.full(num_images, _INCLUDE_FROM_PX)",
+        "np.fmin(_INCLUDE_FROM_PX, 0.5 * tau_px)",
+        "np.full(tau_px.shape, _INCLUDE_FROM_PX)",
         ROUNDS,
     ),
     Named(

@@ -33,7 +33,7 @@ before = pages()
 arrays = [np.ones(1_000_000) for _ in range(30)]
 del arrays
 kept = pages() - before
-print(before, kept, give_back(), pages() - before)
+print(before, kept, give_back(is_limited=True), pages() - before)
 """
 
 
@@ -57,6 +57,54 @@ def test_a_process_that_was_not_asked_keeps_nothing() -> None:
     _, kept, was_much, _ = run("as it is")
     assert int(kept) < 40
     assert was_much == "False"
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine with 8 GB left, where this process keeps 501 MB of its own, and gives back when asked."""
+    (tmp_path / "statm").write_text(f"0 {600_000_000 // 4096 + 1} {99_000_000 // 4096} 0 0 0 0\n")
+    (tmp_path / "meminfo").write_text("MemTotal: 16000000 kB\nMemAvailable: 8000000 kB\n")
+    monkeypatch.setattr(memory.os, "sysconf", lambda _: 4096)
+    monkeypatch.setattr(memory, "_SIZES", tmp_path / "statm")
+    monkeypatch.setattr(memory, "_OF_MACHINE", tmp_path / "meminfo")
+    monkeypatch.setattr(memory, "_OF_GROUP", tmp_path)
+    monkeypatch.setattr(memory, "_of_glibc", lambda _: lambda __: 1)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("available_kb", "group", "is_much"),
+    [
+        (8_000_000, None, False),
+        (7_700_000, None, True),  # less than sixteen times as much
+        (8_000_000, ("max", 10**9), False),
+        (8_000_000, (10**10, 10**9), False),
+        (8_000_000, (9 * 10**9, 10**9), True),  # the group may take 8.0 more, of which 501 MB are above a sixteenth
+        (10**9, ("2 GB", 0), False),
+    ],
+)
+def test_what_is_much_depends_on_what_is_left(
+    machine: Path, available_kb: int, group: tuple[object, int] | None, *, is_much: bool
+) -> None:
+    (machine / "meminfo").write_text(f"MemFree: 1 kB\nMemAvailable: {available_kb} kB\n")
+    for name, value in zip(("max", "current"), group or (), strict=False):
+        (machine / f"memory.{name}").write_text(f"{value}\n")
+    assert memory.give_back() is is_much
+    assert memory.give_back(is_limited=True)
+
+
+@pytest.mark.parametrize("told", ["", "MemAvailable:\n", "MemAvailable: lots\n", None])
+def test_where_nobody_says_what_is_left_it_is_given_back(machine: Path, told: str | None) -> None:
+    (machine / "meminfo").unlink()
+    if told is not None:
+        (machine / "meminfo").write_text(told)
+    assert memory.give_back()
+
+
+def test_little_is_kept_however_little_is_left(machine: Path) -> None:
+    (machine / "meminfo").write_text("MemAvailable: 1 kB\n")
+    (machine / "statm").write_text(f"0 {190_000_000 // 4096} 0 0 0 0 0\n")
+    assert not memory.give_back(is_limited=True)
 
 
 @NEEDS_GLIBC
