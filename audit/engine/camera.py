@@ -133,6 +133,7 @@ def audit_cameras(
     alpha: float,
     tau_px: FloatArray,
     holds: BoolArray,
+    retest: Callable[[int, CameraRecord], MisfitTests],
 ) -> list[CameraAudit]:
     """Audit every camera that has an image with inliers, in the order of the camera table.
 
@@ -140,6 +141,7 @@ def audit_cameras(
     ----------
     quality : per image, None without inliers            sigma_px, tau_px : (I,) sigma_constant_px and materiality
     holds : (I,) images whose pose and consistency hold; the others have no say (one bad pose in 24 makes a wrong lens)
+    retest : the misfit tests of an image under another camera
 
     Notes
     -----
@@ -165,7 +167,7 @@ def audit_cameras(
             group.camera,
             misfit.group if misfit.material else None,
             misfit.material,
-            retest=_retest(group),
+            retest=_retest(group, retest),
             distortion_identified=_distortion_identified([quality[int(i)] for i in group.image_idxs]),
             alpha=alpha,
             tau_px=tau,
@@ -173,6 +175,12 @@ def audit_cameras(
         counts = source.num_points_of(group.image_idxs.tolist()), group.num_observations
         out.append(CameraAudit(group.camera, group.image_idxs, *counts, test, misfit, advice))
     return out
+
+
+def retested(model: SparseModel, residuals: ModelResiduals, image_idx: int, camera: CameraRecord) -> MisfitTests:
+    """Return the misfit tests of the image in a row if it had been fitted with this camera, to first order."""
+    own = image_inliers(model, residuals, image_idx)
+    return image_retest(own.xyz_cam, own.residuals_px)(camera)
 
 
 def _median(values: FloatArray) -> float:
@@ -203,16 +211,11 @@ def _pooled(source: ModelSums, group: _CameraImages, quality: Sequence[CameraQua
     return (group.tests(group.camera, *group.tracks()) if found is None else found).tests
 
 
-def _retest(group: _CameraImages) -> Retest:
+def _retest(group: _CameraImages, of_image: Callable[[int, CameraRecord], MisfitTests]) -> Retest:
     """The geometry waits until it is asked, which happens to few cameras."""
-
-    def retest(camera: CameraRecord) -> MisfitTests:
-        if len(group.image_idxs) == 1:
-            own = group.inliers(0)
-            return image_retest(own.xyz_cam, own.residuals_px)(camera)
-        return group.tests(camera, *group.tracks()).tests
-
-    return retest
+    if len(group.image_idxs) == 1:
+        return partial(of_image, int(group.image_idxs[0]))
+    return lambda camera: group.tests(camera, *group.tracks()).tests
 
 
 def _distortion_identified(quality: Sequence[CameraQuality | None], min_sds: float = 2.0) -> bool:

@@ -14,7 +14,7 @@ from sfm_audit.audit.config import AuditConfig
 from sfm_audit.audit.consistency import ModelConsistency, consistency_of
 from sfm_audit.audit.decision.diagnostics import MisfitDiagnostics, OwnDiagnostics, SharedMisfit
 from sfm_audit.audit.decision.triage import CAMERA_COLUMNS, triage
-from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, settled
+from sfm_audit.audit.engine.camera import CameraAudit, audit_cameras, retested, settled
 from sfm_audit.audit.engine.findings import (
     consistency_findings,
     joint_findings,
@@ -41,12 +41,12 @@ from sfm_audit.audit.engine.rows import camera_columns, model_row
 from sfm_audit.audit.engine.spreading import Spread, in_turn
 from sfm_audit.audit.engine.tables import ModelAudit, Said, images_table, triage_rows
 from sfm_audit.audit.inliers.frames import claimed_frames
-from sfm_audit.audit.inliers.projected import image_inliers, inlier_set
+from sfm_audit.audit.inliers.projected import inlier_set
 from sfm_audit.audit.inliers.residuals import ModelResiduals, model_residuals
 from sfm_audit.audit.inliers.stored_errors import StoredErrors, compare_stored_errors
 from sfm_audit.audit.joint import CameraStep, JointAudit, audit_jointly, included_from
 from sfm_audit.audit.kernels.threads import together
-from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs, image_retest
+from sfm_audit.audit.misfit import MisfitTests, fitted_param_idxs
 from sfm_audit.audit.noise.keypoint import KeypointTracks, keypoint_noise, keypoint_tracks
 from sfm_audit.audit.noise.stack import ConstantFits, constant_fits
 from sfm_audit.audit.noise.standardise import ImageNoise, ModelTracks, constant_noise, model_tracks, track_noise
@@ -86,14 +86,13 @@ class ModelAuditor:
         self.model, self._given, self._spread = model, given, spread
         self.config = config or AuditConfig()
         self._keypoint_scale_px = keypoint_scale_px
-        self._looking = RLock()
+        self._looking, self._retested = RLock(), dict[tuple[int, str, bytes], MisfitTests]()
         if self.config.noise == "keypoint" and keypoint_scale_px is None:
             raise ValueError("the noise model keypoint needs keypoint_scale_px")
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out where images are audited: an unpickled auditor runs serially."""
-        kept = {name: value for name, value in self.__dict__.items() if name != "_looking"}
-        return {**kept, "_spread": in_turn, "_given": NOTHING_GIVEN}
+        return {**self.__dict__, "_spread": in_turn, "_given": NOTHING_GIVEN, "_looking": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take what was kept, with a lock of its own."""
@@ -217,6 +216,7 @@ class ModelAuditor:
             alpha=self.config.alpha,
             tau_px=self.tau_px,
             holds=~self.moved & ~self.consistency.inconsistent,
+            retest=self.retest,
         )
 
     def misfit(self, image_idx: int) -> MisfitDiagnostics | None:
@@ -232,8 +232,10 @@ class ModelAuditor:
 
     def retest(self, image_idx: int, camera: CameraRecord) -> MisfitTests:
         """Return the misfit tests of the image if it had been fitted with this camera, to first order."""
-        own = image_inliers(self.model, self.residuals, image_idx)
-        return image_retest(own.xyz_cam, own.residuals_px)(camera)
+        key = image_idx, camera.model.name, camera.params.tobytes()  # a camera with one image asks what its image asks
+        if key not in self._retested:
+            self._retested[key] = retested(self.model, self.residuals, image_idx, camera)
+        return self._retested[key]
 
     def shared_misfit(self, image_idx: int) -> SharedMisfit | None:
         """Return what the image's camera shows as a whole, if its images together find a material misfit."""

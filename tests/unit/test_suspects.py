@@ -103,3 +103,20 @@ def test_an_auditor_goes_to_another_process_with_what_it_knows(model):
     there = pickle.loads(pickle.dumps(auditor))  # noqa: S301 - our own bytes
     assert [each.misfit for each in there.quality] == [each.misfit for each in known]
     assert there.joint.misfit.effect_px.tolist() == auditor.joint.misfit.effect_px.tolist()
+
+
+def test_a_camera_with_one_image_and_its_image_try_a_lens_once(model, monkeypatch):
+    tried = []
+    original = engine.retested
+
+    def counting(model, residuals, image_idx, camera):
+        tried.append((image_idx, camera.model.name))
+        return original(model, residuals, image_idx, camera)
+
+    monkeypatch.setattr(engine, "retested", counting)
+    tables = ModelAuditor(model).tables()
+    assert {image for image, _ in tried} == set(WRONG)
+    assert len(tried) == len(set(tried))
+    advised = tables.images["advised_camera_model"].to_pylist()
+    assert [advised[image] for image in WRONG] == [tables.cameras["advised_camera_model"][i].as_py() for i in WRONG]
+    assert advised[WRONG[0]] == "RADIAL"

@@ -16,7 +16,7 @@ KERNEL int64_t joint_take_change(
         for (int64_t k = first; k < last; k++) {
             if (k + 2 * AHEAD < num) {
                 const int64_t later = m->by_point[k + 2 * AHEAD];
-                SOON(m->design + later * 2 * width), SOON(m->design + later * 2 * width + 8), SOON(m->design + later * 2 * width + 16);
+                for (int64_t c = 0; c < 2 * width; c += 8) SOON(m->design + later * 2 * width + c);
                 SOON(m->weight + later), SOON(m->left + 2 * later), SOON(out_left + 2 * later);
             }
             const int64_t row = m->by_point[k], image = m->image_of[k];
