@@ -107,17 +107,26 @@ static inline __attribute__((always_inline)) int times_inverse(
     return 1;
 }
 
+/* out (num, FIELDS) += U U^T from, TILE columns of U at a time; panel (num, TILE): room for them. */
+INLINE void add_update(const base_inverse *s, const int64_t *column, int64_t num, const double *from, double *panel, double *out) {
+    for (int64_t k = 0; k < s->num_update; k += TILE) {
+        int64_t some = s->num_update - k < TILE ? s->num_update - k : TILE;
+        double along[TILE * FIELDS] ALIGNED = {0.0};
+        for (int64_t i = 0; i < num; i++) {
+            memcpy(panel + TILE * i, s->update + column[i] * s->num_update + k, (size_t)some * sizeof *panel);
+        }
+        add_products(some, VECTORS, num, panel, TILE, 1, from, FIELDS, along, FIELDS);
+        add_products(num, VECTORS, some, panel, 1, TILE, along, FIELDS, out, FIELDS);
+    }
+}
+
 /* What included fields add to out (num + num_extra, FIELDS): U U^T, border and corner, at num columns of the base and those of
  * num_extra included fields behind them. */
 static inline __attribute__((always_inline)) void add_included(
-    const base_inverse *s, const int64_t *column, int64_t num, int64_t num_extra, const double *from, double *out) {
+    const base_inverse *s, const int64_t *column, int64_t num, int64_t num_extra, const double *from, double *panel, double *out) {
     const int64_t *extra = column + num;
     memset(out + FIELDS * num, 0, (size_t)(num_extra * FIELDS) * sizeof *out);
-    for (int64_t k = 0; k < s->num_update; k++) {
-        double along[FIELDS] = {0.0};
-        for (int64_t i = 0; i < num; i++) add_row(along, s->update[column[i] * s->num_update + k], from + FIELDS * i);
-        for (int64_t i = 0; i < num; i++) add_row(out + FIELDS * i, s->update[column[i] * s->num_update + k], along);
-    }
+    add_update(s, column, num, from, panel, out);
     for (int64_t e = 0; e < num_extra; e++) {
         for (int64_t i = 0; i < num; i++) {
             double x = s->border[column[i] * s->num_extra + extra[e]];
@@ -147,7 +156,7 @@ INLINE void add_symmetric(int64_t num, const double *left, const double *right, 
 typedef struct {
     int64_t most_rows, most_views, most_columns;
     double *xyz, *predicted, *scalar, *dense, *absorbing, *track_score, *scores;
-    double *right, *ordered, *scaled, *solution, *moved;
+    double *right, *ordered, *scaled, *solution, *moved, *panel;
     int32_t *view, *own, *track;
     int64_t *place, *around, *start, *column, *position;
     keyed *keys;
@@ -163,7 +172,7 @@ static double *lined_up(int64_t num, void **all) {
 static int has_room(workspace *w, int64_t num_images, int64_t width) {
     int64_t n = w->most_rows, v = w->most_views, c = w->most_columns;
     w->scalar = lined_up(n * (SCALAR + 2 * DENSE + FIELDS + 3 + 2 + 6), w->all);
-    w->right = lined_up(5 * c * FIELDS, w->all + 1);
+    w->right = lined_up(c * (5 * FIELDS + TILE), w->all + 1);
     w->scores = malloc((size_t)(v * width + 1) * sizeof(double));
     w->view = malloc((size_t)(2 * v + n + 1) * sizeof(int32_t));
     w->place = calloc((size_t)(num_images + 1), sizeof(int64_t));
@@ -173,7 +182,7 @@ static int has_room(workspace *w, int64_t num_images, int64_t width) {
     w->dense = w->scalar + SCALAR * n, w->track_score = w->dense + 2 * DENSE * n;
     w->xyz = w->track_score + FIELDS * n, w->predicted = w->xyz + 3 * n, w->absorbing = w->predicted + 2 * n;
     w->ordered = w->right + c * FIELDS, w->scaled = w->ordered + c * FIELDS, w->solution = w->scaled + c * FIELDS;
-    w->moved = w->solution + c * FIELDS;
+    w->moved = w->solution + c * FIELDS, w->panel = w->moved + c * FIELDS;
     w->own = w->view + v, w->track = w->own + v;
     w->start = w->around + v, w->column = w->start + v + 1, w->position = w->column + c;
     return 1;
@@ -314,7 +323,7 @@ KERNEL int64_t joint_scores(
             status[k] = NEEDS_NUMPY;
             continue;
         }
-        add_included(s, w.column, count[0], count[1], w.ordered, w.solution);
+        add_included(s, w.column, count[0], count[1], w.ordered, w.panel, w.solution);
         spread_columns(m, s, &w, found[0], found[1]);
         joint_second(m, found[0], w.own, w.around, w.start, w.track, w.scores, w.moved, w.track_score);
         memset(v, 0, FIELDS * FIELDS * sizeof *v);
