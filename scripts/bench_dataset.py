@@ -126,7 +126,7 @@ def main() -> None:
     """Parse arguments, simulate, measure, extrapolate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small data set, and a check of the memory")
-    parser.add_argument("--scenes", type=int, default=16, help="half as many tell less: starting processes is a tenth then")
+    parser.add_argument("--scenes", type=int, default=16, help="with few, starting processes counts much")
     parser.add_argument("--images", type=int, default=500, help="per scene")
     parser.add_argument("--small-scenes", type=int, default=100, help="of --small-images images, as in MegaScenes")
     parser.add_argument("--small-images", type=int, default=20)

@@ -149,8 +149,7 @@ def audit_cameras(
     has that image's tests: Hotelling's law holds for few observations too, and clustering by track changes nothing
     there but for points that the image sees twice. q: Benjamini-Hochberg over the model's cameras.
     """
-    audited = np.array([i for i, each in enumerate(quality) if each is not None], dtype=np.int64)
-    groups = _groups_of(model, residuals, audited)
+    groups = _groups_of(model, residuals, np.flatnonzero([each is not None for each in quality]))
     sums = {i: each.sums for i, each in enumerate(quality) if each is not None and each.sums is not None}
     source = ModelSums(model, residuals, sums)
     tests = [_pooled(source, group.only(holds), quality) for group in groups]
