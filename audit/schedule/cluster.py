@@ -10,7 +10,7 @@ import importlib.metadata
 import logging
 import multiprocessing
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 import dask
@@ -28,6 +28,7 @@ _LOOPBACK: Final = "127.0.0.1"
 _CONNECT_SECONDS: Final = 30
 _FIRST_WORKER_SECONDS: Final = 300
 _LOCAL_WORKERS_SECONDS: Final = 60
+_LEAVING_SECONDS: Final = 30
 _AHEAD: Final = 2  # models asked for per thread of the workers
 _LOST: Final = "the cluster was lost; what was finished stays, the same command goes on"
 
@@ -132,7 +133,7 @@ def _client(address: str, jobs: int) -> Iterator[Client]:
         }
         with (
             dask.config.set(settings),
-            _local_cluster() as cluster,
+            _left_in_time(_local_cluster()) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):
             cluster.scale(jobs)
@@ -154,6 +155,19 @@ def _client(address: str, jobs: int) -> Iterator[Client]:
             advice = f"start some: dask worker {address}"
             raise ClusterError(f"--dask {address}: no worker in {_FIRST_WORKER_SECONDS} s; {advice}") from error
         yield client
+
+
+@contextmanager
+def _left_in_time(cluster: LocalCluster) -> Iterator[LocalCluster]:
+    """Close a cluster at the end, and do not wait for ever where a worker was killed while it did (seen with 2024.8).
+
+    What is left of it ends with this process.
+    """
+    try:
+        yield cluster
+    finally:
+        with suppress(TimeoutError):
+            cluster.close(timeout=_LEAVING_SECONDS)
 
 
 def _local_cluster() -> LocalCluster:
