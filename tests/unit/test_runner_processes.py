@@ -234,3 +234,14 @@ def test_an_error_in_the_caller_ends_the_processes_at_once():
         (process,) = [lane.process for lane, _ in lanes._busy.values()]
         raise ZeroDivisionError
     assert not process.is_alive()
+
+
+def test_a_process_whose_memory_is_watched_gives_it_back_whatever_there_is():
+    """One process, asked three times: what it says is what happened after the calls before."""
+    with Lanes[int]() as lanes:
+        answers = []
+        for key, max_bytes in enumerate((None, 1 << 40, None)):
+            lanes.start_limited(key, (max_bytes, None), audit_stubs.given_back)
+            answers += lanes.wait()
+    asked = [{"is_limited": False}, {"is_limited": True}]
+    assert answers == [(0, []), (1, asked[:1]), (2, asked)]
