@@ -1,5 +1,8 @@
 """What does a data set cost? Audit 1, 2, 4, ... scenes of a simulated one: python scripts/bench_dataset.py.
 
+A data set is audited for minutes, and its processes start once: the longest run audits each scene --copies times, so that
+starting them is a fiftieth of it, as it would be a twohundredth of MegaDepth.
+
 Prints per run: images/s, observations/s, CPU per image, and the peak memory of the command and of its largest worker
 process; then what that makes of MegaDepth and MegaScenes, on this machine and on a Dask cluster. With --quick a small
 data set, and exit code 1 when memory grows with the number of scenes (.ci/run). docs/scale.md holds measured numbers.
@@ -10,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,7 +32,7 @@ MEGASCENES = ("MegaScenes", 2_000_000, 100_000)
 NODES = (1, 4, 16, 64)
 CORES_PER_NODE = 16
 WRITES_PER_SECOND = 50.0  # models that one process writes to a disk with fsync; measured by this script where it can
-POLL_SECONDS = 0.05
+POLL_SECONDS = 0.2  # the peak is one that the system keeps: asking more often only takes time from the workers
 MAX_MEMORY_GROWTH = 1.3  # of the largest process from one scene to all of them, in --quick
 
 
@@ -95,16 +99,28 @@ def _peak_mb(pid: int) -> float:
     return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")), 0.0)
 
 
-def curve(root: Path, num_scenes: int, options: Sequence[str], work: Path) -> list[Measured]:
-    """Audit 1, 2, 4, ... and all scenes; print a line for each."""
+def curve(root: Path, num_scenes: int, num_copies: int, options: Sequence[str], work: Path) -> list[Measured]:
+    """Audit 1, 2, 4, ... and all scenes, then their copies too; print a line for each."""
     print(HEADER)
-    counts = sorted({*(2**k for k in range(num_scenes.bit_length())), num_scenes})
+    paths = [scene_folder(root, i) for i in range(num_scenes)]
+    for k in range(1, num_copies):
+        paths += [_copied(scene_folder(root, i), scene_folder(work / f"copy{k}", i)) for i in range(num_scenes)]
+    counts = sorted({*(2**k for k in range(len(paths).bit_length())), num_scenes, len(paths)})
     out = []
     for count in counts:
-        paths = [scene_folder(root, i) for i in range(count)]
-        out.append(measure(paths, work / f"run{count}", options))
+        out.append(measure(paths[:count], work / f"run{count}", options))
         print(out[-1].line(), flush=True)
     return out
+
+
+def _copied(scene: Path, to: Path) -> Path:
+    """The same scene at another place, which is returned; it takes no disk space where that can be."""
+    try:
+        shutil.copytree(scene, to, copy_function=os.link)
+    except (OSError, shutil.Error):  # another disk, or one without links
+        shutil.rmtree(to, ignore_errors=True)
+        shutil.copytree(scene, to)
+    return to
 
 
 def extrapolate(large: Measured, small: Measured, num_cores: int) -> None:
@@ -127,6 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small data set, and a check of the memory")
     parser.add_argument("--scenes", type=int, default=16, help="with few, starting processes counts much")
+    parser.add_argument("--copies", type=int, default=4, help="of each scene, in the longest run")
     parser.add_argument("--images", type=int, default=500, help="per scene")
     parser.add_argument("--small-scenes", type=int, default=100, help="of --small-images images, as in MegaScenes")
     parser.add_argument("--small-images", type=int, default=20)
@@ -137,7 +154,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the measured numbers there")
     args = parser.parse_args()
     if args.quick:
-        args.scenes, args.images, args.small_scenes, args.small_images = 3, 15, 3, 8
+        args.scenes, args.copies, args.images, args.small_scenes, args.small_images = 3, 1, 15, 3, 8
     options = ["--jobs", str(args.jobs), *(["--dask", args.dask] if args.dask else [])]
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
@@ -145,7 +162,7 @@ def main() -> None:
         large = _data(data / "large", DatasetSpec(args.scenes, args.images, defects=args.defects), args.jobs)
         small = _data(data / "small", DatasetSpec(args.small_scenes, args.small_images, defects=0.0), args.jobs)
         print(f"{args.scenes} scenes of {args.images} images, {args.defects:.0%} of them wrong; {' '.join(options)}")
-        curve_large = curve(large, args.scenes, options, work)
+        curve_large = curve(large, args.scenes, args.copies, options, work)
         print(f"{args.small_scenes} scenes of {args.small_images} images")
         print(HEADER)
         at_small = measure([small], work / "small_run", options)

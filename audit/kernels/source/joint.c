@@ -40,43 +40,57 @@ INLINE void crossed(
     }
 }
 
-/* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. Scalars for one
- * row after the other, dense fields for two rows at a time: as many sums as there are registers. */
-INLINE void subtract_fields(
-    const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
-    double *out) {
-    for (int64_t c = 0; c < count; c++) {
-        wide x0 = {0}, x1 = {0}, x2 = {0}, x3 = {0}, y0 = {0}, y1 = {0}, y2 = {0}, y3 = {0};
-        for (int64_t k = 0; k < num; k++) {
-            const double *f = scalar + SCALAR * own[k], *t = through + 2 * ROWS * k + c;
-            wide ax = {t[0], t[0], t[0], t[0]}, ay = {t[ROWS], t[ROWS], t[ROWS], t[ROWS]};
-            wide f0 = LOAD(f), f1 = LOAD(f + 4), f2 = LOAD(f + 8), f3 = LOAD(f + 12);
-            x0 += ax * f0, x1 += ax * f1, x2 += ax * f2, x3 += ax * f3;
-            y0 += ay * f0, y1 += ay * f1, y2 += ay * f2, y3 += ay * f3;
+/* Up to three columns, of x or of y, times all scalars: as many sums as there are registers. */
+INLINE void subtract_scalars(int columns, const int32_t *own, int64_t num, const double *through, const double *scalar, double *out) {
+    wide sum[3][SCALAR / LANES] = {{{0}}};
+    for (int64_t k = 0; k < num; k++) {
+        const double *f = scalar + SCALAR * own[k], *t = through + 2 * ROWS * k;
+        for (int c = 0; c < columns; c++) {
+            wide a = {t[c], t[c], t[c], t[c]};
+            for (int v = 0; v < SCALAR / LANES; v++) sum[c][v] += a * LOAD(f + LANES * v);
         }
-        double *o = out + FIELDS * c;
-        STORE(o) -= x0, STORE(o + 4) -= x1, STORE(o + 8) -= x2, STORE(o + 12) -= x3;
-        STORE(o + 16) -= y0, STORE(o + 20) -= y1, STORE(o + 24) -= y2, STORE(o + 28) -= y3;
     }
-    for (int64_t c = 0; c < count; c += 2) { /* through has zeros behind the last row */
-        wide d0 = {0}, d1 = {0}, d2 = {0}, e0 = {0}, e1 = {0}, e2 = {0};
-        for (int64_t k = 0; k < num; k++) {
-            const double *d = dense + 2 * DENSE * own[k], *t = through + 2 * ROWS * k + c;
-            wide ax = {t[0], t[0], t[0], t[0]}, ay = {t[ROWS], t[ROWS], t[ROWS], t[ROWS]};
-            wide bx = {t[1], t[1], t[1], t[1]}, by = {t[ROWS + 1], t[ROWS + 1], t[ROWS + 1], t[ROWS + 1]};
-            wide p0 = LOAD(d), p1 = LOAD(d + 4), p2 = LOAD(d + 8);
-            wide q0 = LOAD(d + DENSE), q1 = LOAD(d + DENSE + 4), q2 = LOAD(d + DENSE + 8);
-            d0 += ax * p0 + ay * q0, d1 += ax * p1 + ay * q1, d2 += ax * p2 + ay * q2;
-            e0 += bx * p0 + by * q0, e1 += bx * p1 + by * q1, e2 += bx * p2 + by * q2;
-        }
-        double *o = out + FIELDS * c + 2 * SCALAR;
-        STORE(o) -= d0, STORE(o + 4) -= d1, STORE(o + 8) -= d2;
-        if (c + 1 < count) STORE(o + FIELDS) -= e0, STORE(o + FIELDS + 4) -= e1, STORE(o + FIELDS + 8) -= e2;
+    for (int c = 0; c < columns; c++) {
+        for (int v = 0; v < SCALAR / LANES; v++) STORE(out + FIELDS * c + LANES * v) -= sum[c][v];
     }
 }
 
+/* Up to four columns times all dense fields. */
+INLINE void subtract_dense(int columns, const int32_t *own, int64_t num, const double *through, const double *dense, double *out) {
+    wide sum[4][DENSE / LANES] = {{{0}}};
+    for (int64_t k = 0; k < num; k++) {
+        const double *d = dense + 2 * DENSE * own[k], *t = through + 2 * ROWS * k;
+        for (int axis = 0; axis < 2; axis++, d += DENSE, t += ROWS) {
+            for (int c = 0; c < columns; c++) {
+                wide a = {t[c], t[c], t[c], t[c]};
+                for (int v = 0; v < DENSE / LANES; v++) sum[c][v] += a * LOAD(d + LANES * v);
+            }
+        }
+    }
+    for (int c = 0; c < columns; c++) {
+        for (int v = 0; v < DENSE / LANES; v++) STORE(out + FIELDS * c + LANES * v) -= sum[c][v];
+    }
+}
+
+/* out (count, FIELDS) -= sum over views of (rows x A) fields: the fields of the own observation that A leads to. */
+INLINE void subtract_fields(
+    const int32_t *own, int64_t num, int64_t count, const double *through, const double *scalar, const double *dense,
+    double *out) {
+    for (int axis = 0; axis < 2; axis++) {
+        const double *t = through + ROWS * axis;
+        double *o = out + SCALAR * axis;
+        int64_t c = 0;
+        for (; c + 3 <= count; c += 3) subtract_scalars(3, own, num, t + c, scalar, o + FIELDS * c);
+        if (c + 2 == count) subtract_scalars(2, own, num, t + c, scalar, o + FIELDS * c);
+        else if (c + 1 == count) subtract_scalars(1, own, num, t + c, scalar, o + FIELDS * c);
+    }
+    int64_t c = 0;
+    for (out += 2 * SCALAR; c + 4 <= count; c += 4) subtract_dense(4, own, num, through + c, dense, out + FIELDS * c);
+    for (; c + 2 <= count; c += 2) subtract_dense(2, own, num, through + c, dense, out + FIELDS * c);
+    if (c < count) subtract_dense(1, own, num, through + c, dense, out + FIELDS * c);
+}
+
 enum {
-    DEGREE = 8,
     MOMENTS = 48,               /* 45 monomials of degree 0 .. 8, padded */
     OBSERVATIONS = 16, VIEWS = 32, /* so many at once: what they need fits the first cache */
 };
@@ -101,11 +115,12 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
     for (int64_t i = 0; i < num; i++) {
         const double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i, *p = parts->p[i];
         double *moment = parts->moment[i];
-        for (int j = 0; j < SCALAR - 1; j++) moment[j] = f[j];
-        for (int degree = 5, k = 15; degree <= DEGREE; degree++, k++) {
-            for (int j = 0; j < degree; j++, k++) moment[k] = moment[k - degree] * f[1];
-            moment[k] = moment[k - degree - 1] * f[2];
-        }
+        wide left = LOAD(f + 10), right = LOAD(f + 11); /* x^4 .. x y^3, x^3 y .. y^4 */
+        for (int j = 0; j < SCALAR; j += LANES) STORE(moment + j) = LOAD(f + j);
+        STORE(moment + 17) = right * f[2], STORE(moment + 15) = left * f[1], moment[19] = f[14] * f[1];
+        STORE(moment + 24) = right * f[5], STORE(moment + 21) = left * f[3], moment[25] = f[14] * f[3];
+        STORE(moment + 32) = right * f[9], STORE(moment + 28) = left * f[6], moment[32] = f[14] * f[6];
+        STORE(moment + 36) = left * f[10], STORE(moment + 41) = right * f[14], moment[40] = f[14] * f[10];
         for (int j = 0; j < DENSE; j++) {
             double x = d[j], y = d[DENSE + j];
             parts->by_p[i][0][j] = p[0] * x + p[1] * y, parts->by_p[i][1][j] = p[1] * x + p[2] * y;
@@ -203,7 +218,7 @@ INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, own_gr
             int64_t row = o->first + i;
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
             double w = m->weight[row], *a = o->absorbing + 6 * i, *p = parts.p[i - from];
-            if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD]);
+            if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD]), SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD] + 8);
             absorb(m, row, a);
             p[0] = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
             p[1] = -w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
