@@ -17,7 +17,7 @@ from sfm_audit.audit.normality import normality_columns_of
 from sfm_audit.audit.table.given import Column
 from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 
-_MAX_INLIERS_AT_ONCE: Final = 1 << 17
+_MAX_INLIERS_AT_ONCE: Final = 1 << 18
 _MAX_IMAGES_AT_ONCE: Final = 512
 _NOISE: Final = ("sigma_d_px", "sigma_l", "sigma_predicted_px", "scale_ratio")
 _CHOSEN: Final = (

@@ -33,7 +33,7 @@ from sfm_audit.loaders.arrays import BoolArray, FloatArray, IntArray
 from sfm_audit.loaders.model import CameraRecord, SparseModel, moved
 
 _MAX_POINTS_AT_ONCE: Final = 4096
-_POINTS_IN_A_TURN: Final = 1 << 16
+_POINTS_IN_A_TURN: Final = 1 << 18
 _SUSPECT_FROM: Final = 0.5  # of the effect that an image is included from: its points have taken up a part
 
 

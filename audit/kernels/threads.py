@@ -14,7 +14,7 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-RANGE_WEIGHT: Final = 50_000.0
+RANGE_WEIGHT: Final = 100_000.0
 """Observations of a range where nothing else is said: milliseconds of work, where a thread costs 0.1."""
 
 T = TypeVar("T")
