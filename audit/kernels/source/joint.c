@@ -115,7 +115,8 @@ INLINE void add_gram(own_gram *g, gram_parts *parts, int64_t num, const double *
     for (int64_t i = 0; i < num; i++) {
         const double *f = scalar + SCALAR * i, *d = dense + 2 * DENSE * i, *p = parts->p[i];
         double *moment = parts->moment[i];
-        wide left = LOAD(f + 10), right = LOAD(f + 11); /* x^4 .. x y^3, x^3 y .. y^4 */
+        /* degrees 5 to 8: x^4 .. x y^3 times a power of x, x^3 y .. y^4 times one of y; where these meet both say the same */
+        wide left = LOAD(f + 10), right = LOAD(f + 11);
         for (int j = 0; j < SCALAR; j += LANES) STORE(moment + j) = LOAD(f + j);
         STORE(moment + 17) = right * f[2], STORE(moment + 15) = left * f[1], moment[19] = f[14] * f[1];
         STORE(moment + 24) = right * f[5], STORE(moment + 21) = left * f[3], moment[25] = f[14] * f[3];
@@ -218,7 +219,10 @@ INLINE void add_own(const joint_model *m, const own_fields *o, int64_t n, own_gr
             int64_t row = o->first + i;
             const double *jx = m->design + row * 2 * m->width + 3, *jy = jx + m->width;
             double w = m->weight[row], *a = o->absorbing + 6 * i, *p = parts.p[i - from];
-            if (i + AHEAD < n) SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD]), SOON(m->point_inverse + 9 * m->point_idx[row + AHEAD] + 8);
+            if (i + AHEAD < n) {
+                const double *later = m->point_inverse + 9 * m->point_idx[row + AHEAD];
+                SOON(later), SOON(later + 8);
+            }
             absorb(m, row, a);
             p[0] = w - w * (jx[0] * a[0] + jx[1] * a[2] + jx[2] * a[4]);
             p[1] = -w * (jx[0] * a[1] + jx[1] * a[3] + jx[2] * a[5]);
