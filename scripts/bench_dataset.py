@@ -32,7 +32,7 @@ MEGASCENES = ("MegaScenes", 2_000_000, 100_000)
 NODES = (1, 4, 16, 64)
 CORES_PER_NODE = 16
 WRITES_PER_SECOND = 50.0  # models that one process writes to a disk with fsync; measured by this script where it can
-POLL_SECONDS = 0.2  # the peak is one that the system keeps: asking more often only takes time from the workers
+POLL_SECONDS = 0.02, 0.2  # between two looks at memory, whose peak the system keeps: looking takes time from workers
 MAX_MEMORY_GROWTH = 1.3  # of the largest process from one scene to all of them, in --quick
 
 
@@ -69,7 +69,7 @@ def measure(paths: Sequence[Path], run: Path, options: Sequence[str]) -> Measure
         while process.poll() is None:
             for pid in (process.pid, *_descendants(process.pid)):
                 peaks[pid] = max(peaks.get(pid, 0.0), _peak_mb(pid))
-            time.sleep(POLL_SECONDS)
+            time.sleep(float(np.clip((time.perf_counter() - start) / 50, *POLL_SECONDS)))  # little is missed at the end
     seconds, cpu_after = time.perf_counter() - start, os.times()
     if process.returncode:
         sys.exit(f"bench_dataset: sfm-audit run ended with exit code {process.returncode}")
